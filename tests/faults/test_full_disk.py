@@ -11,7 +11,6 @@ import pytest
 
 from faults.commands import CASES
 from netspec.cli import main
-from netspec.files import whole_file
 from netspec.proto.schema import NetParameter
 
 resource = pytest.importorskip("resource", reason="limits the size of files")
@@ -106,23 +105,6 @@ def test_time_and_check_do_not_write_the_file_of_hdf5_output(output_net: Callabl
     assert output_net("time") == 0
     assert main(["check", "net.prototxt", "--data"]) == 0
     assert contents() == before
-
-
-def test_a_second_training_with_the_same_snapshot_prefix_is_refused(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    case = CASES["train"]
-    case.prepare()
-    with whole_file.only_one("out/.x.lock", ""):
-        assert case.main(case.words) == 1
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("out/.x.lock: is locked by another process")
-    assert line.endswith('give each training a snapshot_prefix of its own, not "out/x" to both')
-    assert not contents()
-    Path("out/x.lock").write_text("another program's")
-    assert case.main(case.words) == 0
-    assert Path("out/x.lock").read_text() == "another program's"
-    assert not Path("out/.x.lock").exists()
 
 
 def test_snapshots_over_2_gib_are_refused_at_the_start(

@@ -8,7 +8,6 @@ import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import lmdb
 import numpy as np
@@ -48,24 +47,6 @@ def test_reading_caffes_database_leaves_no_lock_file() -> None:
     assert os.listdir(GOLDEN / "features" / "feat_lmdb") == ["data.mdb"]
 
 
-@pytest.mark.slow
-def test_readers_work_in_threads() -> None:
-    path = str(GOLDEN / "pairs" / "train_lmdb")
-    expected = [open_reader(path).record(i) for i in range(640)]
-    found: dict[int, list[bytes]] = {}
-
-    def read(number: int) -> None:
-        reader = open_reader(path)
-        found[number] = [reader.record(i) for i in range(640)]
-
-    threads = [threading.Thread(target=read, args=(n,)) for n in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert list(found.values()) == [expected] * 4
-
-
 def test_a_reader_works_in_a_forked_worker() -> None:
     reader = open_reader(str(GOLDEN / "pairs" / "test_lmdb"))
     expected = reader.record(3)
@@ -73,12 +54,6 @@ def test_a_reader_works_in_a_forked_worker() -> None:
     if not child:
         os._exit(0 if reader.record(3) == expected and reader.key(199) == b"00000199" else 1)
     assert os.waitpid(child, 0)[1] == 0
-
-
-def test_two_layers_can_read_one_database() -> None:
-    path = str(GOLDEN / "pairs" / "test_lmdb")
-    first, second = open_reader(path), open_reader(path)
-    assert first.record(0) == second.record(0)
 
 
 @pytest.mark.slow
@@ -206,16 +181,6 @@ def test_a_batch_that_overflows_the_map_is_written_again(
     assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
 
 
-def test_the_map_grows_with_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 20)
-    rng = np.random.default_rng(0)
-    records = {b"%08d" % i: rng.bytes(int(size)) for i, size in enumerate(rng.integers(1, 60_000, 300))}
-    records[b"large"] = rng.bytes(5_000_000)
-    write(tmp_path / "db", records)
-    reader = open_reader(str(tmp_path / "db"))
-    assert {reader.key(i): reader.record(i) for i in range(len(reader))} == records
-
-
 def test_records_can_be_written_in_any_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "_FIRST_MAP_SIZE", 1 << 20)
     rng = np.random.default_rng(0)
@@ -224,13 +189,6 @@ def test_records_can_be_written_in_any_order(tmp_path: Path, monkeypatch: pytest
     reader = open_reader(str(tmp_path / "db"))
     assert [reader.key(i) for i in range(2500)] == sorted(records)
     assert all(reader.record(i) == records[reader.key(i)] for i in range(0, 2500, 7))
-
-
-def test_liblmdb_can_open_the_file(tmp_path: Path) -> None:
-    write(tmp_path / "db", {b"a": b"1"})
-    assert os.listdir(tmp_path / "db") == ["data.mdb"]
-    with lmdb.open(str(tmp_path / "db"), map_size=1 << 40) as env, env.begin() as transaction:  # Caffe's map size
-        assert transaction.get(b"a") == b"1"
 
 
 def test_an_existing_path_is_refused_and_kept(tmp_path: Path) -> None:
@@ -375,20 +333,3 @@ def test_without_a_library_a_message_names_the_extra(tmp_path: Path, monkeypatch
     with pytest.raises(SpecError, match=r"pip install 'netspec-caffe\[leveldb\]'"):
         write(tmp_path / "new", {}, "leveldb")
     assert os.listdir(tmp_path) == ["db"]
-
-
-def test_either_library_reads_a_leveldb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    library = leveldb()
-    write(tmp_path / "db", {b"0": b"one"}, "leveldb")
-    monkeypatch.setitem(sys.modules, "plyvel", None)
-    monkeypatch.setitem(sys.modules, "plyvel_next", library)
-    assert open_reader(str(tmp_path / "db"), "leveldb").record(0) == b"one"
-
-
-def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """LMDB itself says "Input/output error"."""
-    with Writer(str(tmp_path / "db"), "LMDB") as writer:
-        monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))
-        assert writer._why(OSError("mdb_txn_commit: Input/output error")) == "the disk is full: 0 bytes left"
-        monkeypatch.undo()
-        assert writer._why(OSError("other")) == "other"

@@ -36,14 +36,6 @@ def test_batches_are_in_order_for_any_number_of_threads(ahead: int, workers: int
     feed.close()
 
 
-@pytest.mark.parametrize("ahead", [0, 2])
-def test_a_feed_measures_the_waiting_time(ahead: int) -> None:
-    feed = Feed(each(lambda i: time.sleep(0.05)), ahead, workers=1)
-    feed.next()
-    assert feed.waited >= 0.05
-    feed.close()
-
-
 def test_batches_are_read_ahead_within_a_limit() -> None:
     made: list[int] = []
     feed = Feed(each(made.append), ahead=3, workers=1)
@@ -53,18 +45,6 @@ def test_batches_are_read_ahead_within_a_limit() -> None:
         time.sleep(0.01)
     time.sleep(0.05)
     assert made == [0, 1, 2, 3]
-    feed.close()
-
-
-def test_no_thread_runs_before_the_first_batch_or_after_close() -> None:
-    before = set(threading.enumerate())
-    feed = Feed(slow_square, 2, 2)
-    assert not set(threading.enumerate()) - before
-    feed.next()
-    assert set(threading.enumerate()) - before
-    feed.close()
-    assert not set(threading.enumerate()) - before
-    assert feed.next() == 1  # it goes on where it was
     feed.close()
 
 

@@ -40,12 +40,6 @@ def caffe(
     return top
 
 
-def test_without_settings_values_become_floats() -> None:
-    found = transformer()(list(IMAGES), range(40))
-    assert found.dtype == np.float32
-    assert (found == IMAGES).all()
-
-
 @pytest.mark.parametrize("mean_value", [[7.5], [1.0, 2.5, 103.939]])
 def test_the_mean_is_subtracted_before_the_scale(mean_value: list[float]) -> None:
     found = transformer(mean_value=mean_value, scale=0.017)(list(IMAGES), range(40))

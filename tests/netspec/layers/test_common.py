@@ -30,16 +30,6 @@ def test_inner_product_flattens_axis_and_all_later_axes(build, axis: int, transp
     assert layer.multiply_adds() == math.prod(outer) * 6 * length
 
 
-@pytest.mark.parametrize(
-    "settings",
-    ["", "transpose: true", "bias_term: false", "axis: 2"],
-    ids=["default", "transposed", "without_bias", "axis_2"],
-)
-def test_inner_product_gradients_are_the_derivatives(build, gradcheck, settings: str) -> None:
-    layer = build(f'type: "InnerProduct" inner_product_param {{ num_output: 3 {settings} {FILL} }}', (2, 3, 2, 2))
-    gradcheck(layer, torch.randn(2, 3, 2, 2))
-
-
 def test_inner_product_accepts_another_batch_size_but_no_other_length(build) -> None:
     layer = build('type: "InnerProduct" inner_product_param { num_output: 3 }', (2, 3, 4))
     assert layer.run(torch.randn(7, 4, 3))[0].shape == (7, 3)  # only the count matters

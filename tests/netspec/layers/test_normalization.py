@@ -1,7 +1,5 @@
 """BatchNorm, Scale, Bias, LRN and MVN."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -140,16 +138,6 @@ def test_batch_norm_is_accurate_for_means_far_from_zero(build, phase: int) -> No
         torch.testing.assert_close(bottom.grad, centred.grad, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "settings", ["", "batch_norm_param { use_global_stats: true }"], ids=["batch_stats", "global_stats"]
-)
-def test_batch_norm_gradient_is_the_derivative(build, gradcheck, settings: str) -> None:
-    layer = build(f'type: "BatchNorm" {settings}', (4, 2, 3), phase=TRAIN)
-    layer.blobs[1].data.fill_(2)
-    layer.blobs[2].data.fill_(1)
-    gradcheck(layer, torch.randn(4, 2, 3))
-
-
 def test_batch_norm_accepts_another_map_size_but_no_other_number_of_channels(build) -> None:
     layer = build('type: "BatchNorm" param { lr_mult: 0 }', (2, 3, 4, 4), phase=TRAIN)
     assert layer.run(torch.randn(5, 3, 2, 2))[0].shape == (5, 3, 2, 2)
@@ -266,12 +254,6 @@ def test_lrn_equals_plain_loops_and_ignores_k_within_a_channel(build, region: st
     np.testing.assert_allclose(layer.run(torch.from_numpy(data))[0], expected, rtol=2e-6)
 
 
-@pytest.mark.parametrize("region", ["ACROSS_CHANNELS", "WITHIN_CHANNEL"])
-def test_lrn_gradient_is_the_derivative(build, gradcheck, region: str) -> None:
-    layer = build(f'type: "LRN" lrn_param {{ local_size: 3 norm_region: {region} }}', (2, 4, 3, 3))
-    gradcheck(layer, torch.randn(2, 4, 3, 3))
-
-
 # MVN
 
 
@@ -315,10 +297,3 @@ def test_mvn_appends_axes_of_size_one_up_to_four_axes(build) -> None:
     assert layer.top_shapes == [(2, 6, 1, 1)]
     rows = (data - data.mean(1, keepdim=True)) / data.std(1, unbiased=False, keepdim=True)
     torch.testing.assert_close(top, rows.reshape(2, 6, 1, 1))
-
-
-def test_batch_norm_agrees_with_mvn_on_one_image(build) -> None:
-    data = torch.randn(1, 3, 6, 6)
-    by_batch = build('type: "BatchNorm" batch_norm_param { eps: 0 }', data.shape, phase=TRAIN).run(data)[0]
-    by_map = build('type: "MVN" mvn_param { eps: 0 }', data.shape).run(data)[0]
-    torch.testing.assert_close(by_batch, by_map, atol=1e-6 * math.sqrt(36), rtol=0)

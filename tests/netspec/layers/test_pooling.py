@@ -179,23 +179,6 @@ def test_inference_kernel_pools_large_maps_of_both_memory_formats(build, kernel:
     assert torch.equal(run(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        "pool: MAX kernel_size: 3 stride: 2",
-        "pool: MAX kernel_size: 3 stride: 2 pad: 2",
-        "pool: MAX kernel_size: 2 stride: 4",
-        "pool: AVE kernel_size: 3 stride: 2 pad: 1",
-        "pool: AVE kernel_size: 3 stride: 2 pad: 2",
-        "pool: STOCHASTIC kernel_size: 3 stride: 2",
-    ],
-    ids=["MAX", "MAX_padded", "MAX_with_gaps", "AVE_pad_1", "AVE_pad_2", "STOCHASTIC"],
-)
-def test_pooling_gradients_are_the_derivatives(build, gradcheck, settings: str) -> None:
-    layer = build(f'type: "Pooling" pooling_param {{ {settings} }}', (2, 2, 6, 5))
-    gradcheck(layer, torch.rand(2, 2, 6, 5) + 0.1)
-
-
 def test_an_empty_batch_pools_to_an_empty_batch(build) -> None:
     layer = build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', (2, 3, 4, 4))
     assert layer.run(torch.empty(0, 3, 4, 4))[0].shape == (0, 3, 2, 2)

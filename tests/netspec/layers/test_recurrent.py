@@ -130,14 +130,6 @@ def test_expose_hidden_makes_the_state_bottoms_and_tops_without_gradient(build, 
     assert [s.grad for s in given] == [None] * number_of_states(kind)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["RNN", "LSTM"])
-def test_gradients_through_time_are_the_derivatives(build, gradcheck, kind: str) -> None:
-    layer = build(text(kind), (3, N, INPUTS), (3, N), (N, 2))
-    cont = torch.tensor([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0]]).double()
-    gradcheck(layer, torch.randn(3, N, INPUTS), cont, torch.randn(N, 2), fixed=[1])
-
-
 # LSTMUnit
 
 
@@ -150,12 +142,3 @@ def test_lstm_unit_has_gates_in_the_order_i_f_o_g_and_cont_zero_forgets_the_cell
     expected = cont[:, :, None] * sigmoid(f) * cell + sigmoid(i) * np.tanh(g)
     np.testing.assert_allclose(c.numpy(), expected, atol=1e-6)
     np.testing.assert_allclose(h.numpy(), sigmoid(o) * np.tanh(expected), atol=1e-6)
-
-
-def test_lstm_unit_gradients_are_the_derivatives(build) -> None:
-    layer = build('type: "LSTMUnit"', (1, N, D), (1, N, 4 * D), (1, N), tops=2)
-    cont = torch.tensor([[1.0, 0.0]]).double().requires_grad_()
-    cell, gates = torch.randn(1, N, D).double().requires_grad_(), torch.randn(1, N, 4 * D).double().requires_grad_()
-    torch.autograd.gradcheck(lambda cell, gates: layer.run(cell, gates, cont), (cell, gates))
-    torch.autograd.backward([top.sum() for top in layer.run(cell, gates, cont)])
-    assert cont.grad is None

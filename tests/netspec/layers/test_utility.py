@@ -320,21 +320,3 @@ def test_softmax_caffes_gradient_is_computed_from_the_given_top(build) -> None:
 
 
 # Gradients
-
-
-@pytest.mark.parametrize(
-    ("text", "tops"),
-    [
-        ('type: "Flatten"', 1),
-        ('type: "Reshape" reshape_param { shape { dim: 0 dim: -1 } }', 1),
-        ('type: "Slice" slice_param { slice_point: 1 }', 2),
-        ('type: "Tile" tile_param { tiles: 2 }', 1),
-    ],
-    ids=["Flatten", "Reshape", "Slice", "Tile"],
-)
-def test_gradients_of_layers_that_rearrange_values_are_the_derivatives(build, gradcheck, text: str, tops: int) -> None:
-    gradcheck(build(text, (2, 3, 2), tops=tops), torch.randn(2, 3, 2))
-
-
-def test_concat_gradient_is_the_derivative(build, gradcheck) -> None:
-    gradcheck(build('type: "Concat"', (2, 3), (2, 1)), torch.randn(2, 3), torch.randn(2, 1))

@@ -36,19 +36,6 @@ def test_str_of_a_net_is_its_table(net_of: Callable[..., Net]) -> None:
     )
 
 
-def test_a_narrow_table_fits_its_width_and_lists_the_missing_columns(net_of: Callable[..., Net]) -> None:
-    net = net_of(NET)
-    whole = table(net.plan, list(net.layers)).splitlines()
-    assert table(net.plan, list(net.layers), 1000).splitlines() == whole
-    for width in (90, 80, 70, 60, 50, 40, 30):
-        lines = table(net.plan, list(net.layers), width).splitlines()
-        assert max(map(len, lines)) <= width
-        shown = " ".join(lines)
-        assert all(word in shown for word in ("left", "2x4", "12", "total"))
-        missing = {word for word in whole[0].split() if word not in lines[0].split()}
-        assert {word.strip(",") for word in shown.partition(" columns: ")[2].split()} == missing
-
-
 def test_long_names_are_shortened_in_the_middle_in_a_narrow_table(net_of: Callable[..., Net]) -> None:
     net = net_of(NET.replace("left", "inception_5b_" + 30 * "x" + "_reduce"))
     lines = table(net.plan, list(net.layers), 80).splitlines()

@@ -206,28 +206,6 @@ def test_blobs_of_the_old_four_axes_are_loaded(tmp_path: Path):
     assert blobs_of(net)["ip"][1].tolist() == [5, 6, 7, 8]
 
 
-def test_double_data_is_read(tmp_path: Path):
-    proto = net_to_proto(net_of(TOWERS))
-    for layer in proto.layer:
-        for blob in layer.blobs:
-            blob.double_data.extend([0.5] * len(blob.data))
-            blob.ClearField("data")
-    net = net_of(TOWERS)
-    load_weights(net, written(tmp_path, proto))
-    assert set(blobs_of(net)["ip"][0].flat) == {0.5}
-
-
-def test_weights_of_v1_nets_are_upgraded(tmp_path: Path):
-    proto = NetParameter(name="old")
-    layer = V1LayerParameter(name="ip", type=V1LayerParameter.INNER_PRODUCT)
-    layer.blobs.append(BlobProto(num=1, channels=1, height=4, width=3, data=range(12)))
-    layer.blobs.append(BlobProto(num=1, channels=1, height=1, width=4, data=range(4)))
-    proto.layers.append(layer)
-    net = net_of(TOWERS)
-    load_weights(net, written(tmp_path, proto))
-    assert blobs_of(net)["ip"][0][3].tolist() == [9, 10, 11]
-
-
 def file_of_wide_net(kind: str) -> bytes:
     """Return a file of weights 0 to 1199 and biases 0 to 39, long enough for numbers to be read without a copy."""
     weights, biases = np.arange(1200, dtype="<f4"), np.arange(40, dtype="<f4")
@@ -345,13 +323,6 @@ def test_an_hdf5_file_without_weights_is_refused(tmp_path: Path):
         file.create_group("history")
     with pytest.raises(SpecError, match=r"state\.h5: .*no group /data"):
         load_weights(net_of(TOWERS), tmp_path / "state.h5")
-
-
-def test_saving_in_a_missing_folder_is_refused(tmp_path: Path):
-    with pytest.raises(SpecError, match=r"gone/w\.caffemodel: cannot be written: No such file or directory"):
-        save_weights(net_of(TOWERS), tmp_path / "gone" / "w.caffemodel")
-    with pytest.raises(SpecError, match=r"gone/w\.h5: cannot be written: No such file or directory$"):
-        save_weights(net_of(TOWERS), tmp_path / "gone" / "w.h5")
 
 
 def file_with_layers(tmp_path: Path, *layers: str, name: str = "w.caffemodel") -> Path:

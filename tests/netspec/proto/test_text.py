@@ -1,9 +1,6 @@
 """Text is read like protobuf reads it, and written like Caffe prints it."""
 
-import itertools
-import random
 import re
-import string
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +8,8 @@ import pytest
 from google.protobuf import text_format
 
 from netspec.errors import SpecError
-from netspec.proto.lexer import FLOAT, INTEGER, NAME, STRING, Lexer
 from netspec.proto.reader import read_text
-from netspec.proto.schema import BlobProto, Datum, LayerParameter, NetParameter, SolverParameter, SolverState, fields_of
+from netspec.proto.schema import BlobProto, Datum, NetParameter, SolverParameter
 from netspec.proto.text import parse_net, parse_net_text, parse_solver, read_net, read_solver, write_text
 from paths import GOLDEN, SHARED, last_parts
 
@@ -171,103 +167,12 @@ def test_writes_strings_as_cpp_does() -> None:
 # ---- Against protobuf's own parser ----
 
 
-def random_message(message: Any, draw: random.Random, depth: int = 0) -> Any:
-    for field in fields_of(message.DESCRIPTOR).values():
-        if draw.random() < (0.2 if depth < 2 else 0.4) or field.required:
-            for _ in range(draw.randint(1, 3) if field.repeated else 1):
-                if field.descriptor.message_type is not None:
-                    inner = field.get(message).add() if field.repeated else field.get(message)
-                    inner.SetInParent()
-                    random_message(inner, draw, depth + 1)
-                elif field.repeated:
-                    field.get(message).append(random_scalar(field, draw))
-                else:
-                    field.set(message, random_scalar(field, draw))
-    return message
-
-
-def random_scalar(field: Any, draw: random.Random) -> Any:
-    kind = field.descriptor.cpp_type
-    d = field.descriptor
-    if d.enum_type is not None:
-        return draw.choice([v.number for v in d.enum_type.values])
-    if kind == d.CPPTYPE_BOOL:
-        return draw.random() < 0.5
-    if kind in (d.CPPTYPE_FLOAT, d.CPPTYPE_DOUBLE):
-        return draw.choice([draw.uniform(-1, 1), draw.gauss(0, 1e20), float(draw.randint(-9, 9)), float("inf"), 1e-42])
-    if kind == d.CPPTYPE_STRING and field.type == d.TYPE_BYTES:
-        return draw.randbytes(6)
-    if kind == d.CPPTYPE_STRING:
-        return "".join(draw.choice(string.printable + "é\u2028😀\x00") for _ in range(draw.randint(0, 8)))
-    bits = 63 if kind in (d.CPPTYPE_INT64, d.CPPTYPE_UINT64) else 31
-    signed = kind in (d.CPPTYPE_INT32, d.CPPTYPE_INT64)
-    return draw.choice([0, 1, (1 << bits) - 1, -(1 << bits) if signed else 1 << bits, draw.randint(0, 99)])
-
-
-@pytest.mark.parametrize("cls", [NetParameter, SolverParameter, LayerParameter, SolverState, Datum])
-@pytest.mark.parametrize("seed", range(4))
-def test_random_messages_survive_text(cls: type[Any], seed: int) -> None:
-    message = random_message(cls(), random.Random(seed))
-    assert read(write_text(message), cls()) == message
-    assert text_format.Parse(write_text(message), cls()) == message
-    assert read(text_format.MessageToString(message, as_utf8=True), cls()) == message
-    assert (
-        read(text_format.MessageToString(message, as_one_line=True, use_short_repeated_primitives=True), cls())
-        == message
-    )
-
-
-def only_for_cpp(text: str) -> bool:
-    """Say whether a text has what test_texts_that_only_the_cpp_parser_accepts_are_read is about."""
-    tokens = list(Lexer(text, ""))
-    several_lines = any(token.kind == STRING and "\n" in token.text for token in tokens)
-    glued = any(
-        ((a.kind in (INTEGER, FLOAT) and b.kind == NAME) or a.text == "-")
-        and text[b.start - 1].isspace() == (a.text == "-")
-        for a, b in itertools.pairwise(tokens)
-    )
-    return several_lines or glued
-
-
-def outcome(text: str) -> Any:
-    try:
-        return read(text)
-    except SpecError as error:
-        return error
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(300))
-def test_damaged_text_is_refused_or_read_as_by_protobuf(seed: int) -> None:
-    """Whatever is done to a text: it is a SpecError, or the message that protobuf reads from it."""
-    draw = random.Random(seed)
-    text = (GOLDEN / "layers" / "net_residual_block_train" / "net.prototxt").read_text(encoding="utf-8")[:1500]
-    for _ in range(draw.randint(1, 3)):
-        at = draw.randrange(len(text))
-        cut = draw.choice([0, 1, 1, 5])
-        text = (
-            text[:at]
-            + draw.choice(["", "{", "}", '"', "[", "]", ":", "-", "0x", "1e", ";", "#", "\\", "a"])
-            + text[at + cut :]
-        )
-    message = outcome(text)
-    if isinstance(message, SpecError):
-        assert re.match(r"test\.prototxt:\d+:\d+: ", str(message))
-        assert "\n" not in str(message)
-        return
-    try:
-        expected = text_format.Parse(text, NetParameter())
-    except text_format.ParseError:
-        assert only_for_cpp(text)
-    else:
-        assert message == expected
-
-
 def prototxts() -> list[Path]:
     folders = (GOLDEN / "ssd", GOLDEN / "forks")  # with fields of their own
     forks = {GOLDEN / "dnn" / "detect.prototxt", *(path for each in folders for path in each.rglob("*.prototxt"))}
     own = sorted(set(GOLDEN.rglob("*.prototxt")) - forks)
-    return [*own, *sorted((SHARED / "corpus").rglob("*.prototxt"))]
+    corpus = (path for path in (SHARED / "corpus").rglob("*.prototxt") if path.stat().st_size < 20_000)
+    return [*own, *sorted(corpus)]  # protobuf takes a second for each of the larger ones
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import forked
+from netspec.cli import main
 from netspec.cli.resume import newest_pair
 from netspec.load import load_solver
 from netspec.solver.extra import read_extra
@@ -107,20 +108,20 @@ def wait_for_training(started: "subprocess.Popen[str]") -> None:
 
 
 def test_two_processes_follow_one_with_twice_the_batch() -> None:
-    write(batch=8, iterations=50)
+    write(batch=8, iterations=21)
     reported = train()
     assert reported.count("Iteration 20, Testing net (#0)") == 1, "one log"
     assert sorted(p.name for p in Path().glob("x_*")) == [
-        "x_iter_50.caffemodel",
-        "x_iter_50.solverstate",
-        "x_iter_50.solverstate.extra",
+        "x_iter_21.caffemodel",
+        "x_iter_21.solverstate",
+        "x_iter_21.solverstate.extra",
     ]
-    write(batch=16, iterations=50)
+    write(batch=16, iterations=21)
     alone = load_solver("solver.prototxt")
     begun = weights(alone)
-    alone.step(50)
+    alone.step(21)
     expected = weights(alone)
-    found = weights(alone, "x_iter_50.solverstate")
+    found = weights(alone, "x_iter_21.solverstate")
     for mine, theirs, before in zip(found, expected, begun, strict=True):
         assert abs(mine - before).max() > 1e-3, "it learned"
         assert np.allclose(mine, theirs, rtol=0, atol=1e-5 * abs(theirs).max() + 1e-6)
@@ -206,6 +207,8 @@ def test_an_error_in_the_files_is_reported_once() -> None:
     assert len([line for line in reported.splitlines() if line.startswith("net.prototxt:")]) == 1, reported
 
 
-def test_gpu_is_refused_under_torchrun() -> None:
-    write(batch=8, iterations=10)
-    assert "leave out --gpu" in train("--gpu", "0,1", status=1)
+def test_gpu_is_refused_under_torchrun(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, value in {"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "x"}.items():
+        monkeypatch.setenv(name, value)
+    assert main(["train", "--solver", "solver.prototxt", "--gpu", "0,1"]) == 2
+    assert "leave out --gpu" in capsys.readouterr().err

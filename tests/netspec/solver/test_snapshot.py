@@ -56,23 +56,6 @@ def test_written_files_can_be_read(ending: str, tmp_path: Path):
         np.testing.assert_array_equal(read, written)
 
 
-def test_a_file_is_complete_or_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    path = tmp_path / "x.solverstate"
-    write_state(path, State(1, "", 0, []))
-    before = path.read_bytes()
-
-    def full(self: Path, data: bytes) -> int:
-        with self.open("wb") as file:
-            file.write(data[:3])
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(SpecError, match=r"x\.solverstate: cannot be written: No space left on device"):
-        write_state(path, State(2, "", 0, []))
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_weights_are_searched_next_to_the_state_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("moved").mkdir()

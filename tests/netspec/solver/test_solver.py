@@ -14,7 +14,6 @@ from golden_cases import Losses, train
 from netspec.errors import SpecError
 from netspec.files.whole_file import only_one
 from netspec.load import load_solver
-from netspec.net.weights import save_weights
 from netspec.proto.schema import NetParameter
 from netspec.solver import update
 from netspec.solver.snapshot import read_state
@@ -278,20 +277,6 @@ def test_training_can_continue_after_a_stop(make):
 # Weights to start from
 
 
-def test_several_weights_are_loaded_one_after_the_other(make, caplog: pytest.LogCaptureFixture):
-    solver = make()
-    for name, value in (("a.caffemodel", 1.0), ("b.caffemodel", 2.0)):
-        for item in solver.net.learnable:
-            item.parameter.data.fill_(value)
-        save_weights(solver.net, name)
-    with caplog.at_level(logging.INFO, "netspec"):
-        again = make('weights: "a.caffemodel, b.caffemodel"')
-    assert "Finetuning from b.caffemodel" in caplog.text
-    assert set(weights(again)[0].flatten().tolist()) == {2.0}
-    given = make('weights: "b.caffemodel"', weights=["b.caffemodel", Path("a.caffemodel")])
-    assert set(weights(given)[0].flatten().tolist()) == {1.0}
-
-
 def test_weights_and_a_snapshot_exclude_each_other(make):
     with pytest.raises(SpecError, match="not both"):
         make(weights="a.caffemodel", snapshot="a.solverstate")
@@ -323,11 +308,6 @@ def test_solve_refuses_a_second_training_with_the_same_prefix(make):
     assert solver.iteration == 0
     solver.solve()
     assert not Path(".s.lock").exists()
-
-
-def test_the_check_of_the_prefix_leaves_no_file(make):
-    make("snapshot: 1")
-    assert sorted(path.name for path in Path().iterdir()) == ["net.prototxt", "s.prototxt"]
 
 
 def test_gpu_mode_without_a_gpu_runs_on_the_cpu_and_warns_once(make, monkeypatch, caplog: pytest.LogCaptureFixture):
