@@ -1,38 +1,32 @@
 """Parses the part of the .proto language in which dialects declare their additions, into descriptors.
 
 It supports messages, enums inside or outside messages, optional, repeated and required fields with ``default`` and
-``packed``, and ``extend``.
+``packed``, and ``extend``. Comments stand between statements.
 """
 
 from __future__ import annotations
 
 import re
+from functools import partial
+from typing import Any
 
-from google.protobuf.descriptor_pb2 import (
-    DescriptorProto,
-    EnumDescriptorProto,
-    FieldDescriptorProto,
-    FileDescriptorProto,
-)
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
 from netspec.errors import SpecError, Where
 
-_TOKEN = re.compile(
-    r"""(?P<skip> (?: \s+ | //[^\n]* | /\*.*?\*/ )+ )
-      | (?P<word> [A-Za-z_.][\w.]* | -?[0-9.][\w.+]* (?: (?<=[eE])-[0-9]+ )? | -(?:inf|nan) | "[^"\n]*" | [{}\[\]=;,] )
-      | (?P<wrong> . )
+_BETWEEN = re.compile(r"(?:\s+|//[^\n]*|/\*.*?\*/)*", re.DOTALL)
+_STATEMENT = re.compile(
+    r"""(?P<block> message | enum | extend ) \s+ (?P<name> [\w.]+ ) \s* \{
+      | (?P<end> \} )
+      | (?P<label> optional | required | repeated ) \s+ (?P<type> [\w.]+ ) \s+ (?P<field> \w+ ) \s* = \s*
+        (?P<number> \w+ ) \s* (?: \[ (?P<options> (?: [^\]"] | "[^"]*" )* ) \] \s* )? ;
+      | (?P<value> \w+ ) \s* = \s* (?P<of_value> -?\w+ ) \s* ;
     """,
-    re.VERBOSE | re.DOTALL,
+    re.VERBOSE,
 )
-_LABELS = {
-    "optional": FieldDescriptorProto.LABEL_OPTIONAL,
-    "required": FieldDescriptorProto.LABEL_REQUIRED,
-    "repeated": FieldDescriptorProto.LABEL_REPEATED,
-}
-_SCALARS = {
-    name: FieldDescriptorProto.Type.Value(f"TYPE_{name.upper()}")
-    for name in ("double", "float", "int64", "uint64", "int32", "uint32", "bool", "string", "bytes")
-}
+_OPTION = re.compile(r'\s*(default|packed)\s*=\s*("[^"]*"|[^\s,"]+)\s*(?:,|$)')
+_SCALARS = ("double", "float", "int64", "uint64", "int32", "uint32", "bool", "string", "bytes")
+_EXPECTED = "expected message, enum, extend, or a field such as optional float scale = 1 [default = 2];"
 
 
 def read_declarations(source: str, file: str, package: str) -> FileDescriptorProto:
@@ -40,112 +34,59 @@ def read_declarations(source: str, file: str, package: str) -> FileDescriptorPro
 
     Types are kept as written, for a descriptor pool to resolve. Raises SpecError for a syntax error.
     """
-    return _Declarations(source, file).read(package)
-
-
-class _Declarations:
-    """A recursive descent parser; ``self.next`` is the index of the next word."""
-
-    def __init__(self, source: str, file: str) -> None:
-        self.source, self.file = source, file
-        self.words = [match for match in _TOKEN.finditer(source) if not match["skip"]]
-        self.next = 0
-
-    def read(self, package: str) -> FileDescriptorProto:
-        result = FileDescriptorProto(name=self.file, package=package, syntax="proto2", dependency=["caffe.proto"])
-        while self.next < len(self.words):
-            word = self._take()
-            if word == "message":
-                self._message(result.message_type.add())
-            elif word == "enum":
-                self._enum(result.enum_type.add())
-            elif word == "extend":
-                extendee = self._take()
-                self._take("{")
-                while not self._accept("}"):
-                    self._field(result.extension.add(extendee=extendee), self._take())
-            else:
-                raise self._error(f'expected message, enum or extend, found "{word}"')
-        return result
-
-    def _message(self, result: DescriptorProto) -> None:
-        result.name = self._take()
-        self._take("{")
-        while not self._accept("}"):
-            word = self._take()
-            if word == "enum":
-                self._enum(result.enum_type.add())
-            elif word == "message":
-                self._message(result.nested_type.add())
-            else:
-                self._field(result.field.add(), word)
-
-    def _enum(self, result: EnumDescriptorProto) -> None:
-        result.name = self._take()
-        self._take("{")
-        while not self._accept("}"):
-            name = self._take()
-            self._take("=")
-            result.value.add(name=name, number=self._integer())
-            self._take(";")
-
-    def _field(self, result: FieldDescriptorProto, label: str) -> None:
-        if label not in _LABELS:
-            raise self._error(f'expected optional, repeated or required, found "{label}"')
-        result.label = _LABELS[label]
-        kind = self._take()
-        if kind in _SCALARS:
-            result.type = _SCALARS[kind]
-        else:
-            result.type_name = kind
-        result.name = self._take()
-        self._take("=")
-        result.number = self._integer()
-        if self._accept("["):
-            self._option(result)
-            while self._accept(","):
-                self._option(result)
-            self._take("]")
-        self._take(";")
-
-    def _option(self, result: FieldDescriptorProto) -> None:
-        option = self._take()
-        if option not in ("default", "packed"):
-            raise self._error(f'unknown option "{option}"')
-        self._take("=")
-        value = self._take()
-        if option == "packed":
-            result.options.packed = value == "true"
-        elif value.lower().startswith(("0x", "-0x")):
-            result.default_value = str(int(value, 0))
-        else:
-            result.default_value = value[1:-1] if value.startswith('"') else value
-
-    def _integer(self) -> int:
-        word = self._take()
+    result = FileDescriptorProto(name=file, package=package, syntax="proto2", dependency=["caffe.proto"])
+    blocks: list[Any] = [result]  # those that are open: descriptors, and what adds a field of an ``extend``
+    position = 0
+    while (position := _BETWEEN.match(source, position).end()) < len(source):  # type: ignore[union-attr]
+        found = _STATEMENT.match(source, position)
         try:
-            return int(word, 0)
-        except ValueError:
-            raise self._error(f'expected an integer, found "{word}"') from None
+            _add(blocks, found)
+        except (AttributeError, TypeError, ValueError):  # a wrong number, or what this block cannot have
+            words = source[position:].splitlines()[0][:50]
+            raise _error(source, file, position, f'{_EXPECTED} found "{words}"') from None
+        position = found.end()  # type: ignore[union-attr]
+    if len(blocks) > 1:
+        raise _error(source, file, position, "the declarations end too early")
+    return result
 
-    def _accept(self, text: str) -> bool:
-        found = self.next < len(self.words) and self.words[self.next].group() == text
-        self.next += found
-        return found
 
-    def _take(self, expected: str = "") -> str:
-        if self.next == len(self.words):
-            raise self._error("the declarations end too early", len(self.source))
-        match = self.words[self.next]
-        self.next += 1
-        if match["wrong"]:
-            raise self._error(f'unexpected character "{match.group()}"')
-        if expected and match.group() != expected:
-            raise self._error(f'expected "{expected}", found "{match.group()}"')
-        return match.group()
+def _add(blocks: list[Any], found: Any) -> None:
+    """Add a statement to the block that was opened last."""
+    inner, name = blocks[-1], found["name"]
+    if found["block"] == "message":
+        blocks.append((inner.message_type if inner is blocks[0] else inner.nested_type).add(name=name))
+    elif found["block"] == "enum":
+        blocks.append(inner.enum_type.add(name=name))
+    elif found["block"] and inner is blocks[0]:
+        blocks.append(partial(inner.extension.add, extendee=name))
+    elif found["end"] and len(blocks) > 1:
+        blocks.pop()
+    elif found["value"]:
+        inner.value.add(name=found["value"], number=int(found["of_value"], 0))
+    else:
+        _fill(inner() if callable(inner) else inner.field.add(), found)
 
-    def _error(self, message: str, start: int | None = None) -> SpecError:
-        """Return the error at a place in the source, by default that of the last word."""
-        start = self.words[self.next - 1].start() if start is None else start
-        line = self.source.count("\n", 0, start) + 1
-        return SpecError(message, Where(self.file, line, start - self.source.rfind("\n", 0, start)))
+
+def _fill(field: FieldDescriptorProto, found: Any) -> None:
+    field.name, field.number = found["field"], int(found["number"], 0)
+    field.label = FieldDescriptorProto.Label.Value(f"LABEL_{found['label'].upper()}")
+    if found["type"] in _SCALARS:
+        field.type = FieldDescriptorProto.Type.Value(f"TYPE_{found['type'].upper()}")
+    else:
+        field.type_name = found["type"]
+    options = found["options"] or ""
+    while options:
+        option = _OPTION.match(options)
+        name, value = option.groups()  # type: ignore[union-attr]
+        if name == "packed":
+            field.options.packed = value == "true"
+        elif value.lower().startswith(("0x", "-0x")):
+            field.default_value = str(int(value, 0))
+        else:
+            field.default_value = value.strip('"')
+        options = options[option.end() :]  # type: ignore[union-attr]
+
+
+def _error(source: str, file: str, position: int, message: str) -> SpecError:
+    line = source.count("\n", 0, position) + 1
+    return SpecError(message, Where(file, line, position - source.rfind("\n", 0, position)))

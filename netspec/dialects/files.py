@@ -1,7 +1,7 @@
 """Finding the files of dialects, and reading their declarations without running them.
 
 ``DECLARATIONS`` and the types of the layers are read from a file's syntax (how to write one: netspec/dialects), so
-that a hint about a dialect needs neither torch nor the execution of installed code.
+that a hint about a dialect needs no torch.
 """
 
 from __future__ import annotations
@@ -10,17 +10,14 @@ import ast
 import re
 from collections.abc import Iterator
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from netspec import log
 from netspec.dialects.registry import Dialect
 from netspec.errors import SpecError, Where, did_you_mean
 from netspec.files.kinds import unreadable
 
 OF_FILES = "netspec_dialect_"  # begins the names of modules that are given by their paths
-GROUP = "netspec.dialects"  # entry points of other packages: the name of a dialect and its module
 
 
 class DialectFile(NamedTuple):
@@ -33,19 +30,8 @@ class DialectFile(NamedTuple):
 
 @cache
 def known_files() -> dict[str, DialectFile]:
-    """Return the dialects by name: those in this folder, and those of installed packages' entry points."""
-    from importlib.metadata import entry_points  # imported here, since it is slow to import
-
+    """Return netspec's own dialects by name."""
     found = {}
-    for point in entry_points(group=GROUP):
-        try:
-            spec = find_spec(point.module)
-        except Exception:  # an error in another package's import must not hide the user's own error
-            spec = None
-        if spec and spec.origin:
-            found[point.name] = DialectFile(point.name, Path(spec.origin), point.module)
-        else:
-            log.logger.warning(f'dialect "{point.name}": there is no module {point.module}; the dialect is ignored')
     for path in sorted(Path(__file__).parent.glob("*/*.py"), key=lambda path: path.stem):
         if "\nDECLARATIONS = " in path.read_text("utf-8"):
             found[path.stem] = DialectFile(path.stem, path, f"{__package__}.{path.parent.name}.{path.stem}")

@@ -9,9 +9,9 @@ from typing import Any
 
 from typing_extensions import override
 
-from netspec.dialects import known, registry, use_dialect
+from netspec.dialects import known, registry
 from netspec.dialects.blocks.settings import SettingsRates
-from netspec.dialects.files import find_file
+from netspec.dialects.files import find_file, read_dialect
 from netspec.dialects.signatures import SIGNATURES, fork_of
 from netspec.errors import SpecError, Where
 from netspec.proto.forks import Additions, Forks, Meaning
@@ -22,7 +22,7 @@ NAMED = re.compile(r"^[ \t]*#[ \t]*dialect:[ \t]*(\w+)[ \t]*\r?$", re.MULTILINE)
 
 
 class Dialects(Forks):
-    """The dialects in this folder, in installed packages, and in files that a user named."""
+    """The dialects in this folder, and in files that a user named."""
 
     new = "docs/layer.md shows how to add one with --plugin FILE.py"
     rates = SettingsRates()
@@ -34,7 +34,12 @@ class Dialects(Forks):
 
     @override
     def use(self, name: str | Path) -> None:
-        use_dialect(name)
+        from netspec.dialects.layers import load  # imported here, since it needs torch
+
+        dialect = read_dialect(find_file(name))
+        if dialect.name not in known.added() or dialect != known.dialect(dialect.name):
+            load(dialect)
+            known.add(dialect)
 
     @override
     def additions(self) -> Additions:

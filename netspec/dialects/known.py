@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from netspec import log
 from netspec.dialects.files import OF_FILES, known_files, read_dialect
 from netspec.dialects.registry import Dialect, declare
-from netspec.errors import SpecError
 from netspec.proto.forks import Additions
 
 # Layers that people ask for and that no dialect has, with their forks
@@ -59,16 +57,10 @@ def dialect_of_module(module: str) -> str:
 
 @cache
 def _found() -> dict[str, Dialect]:
-    """Return the dialects in this folder and in packages. A file that cannot be read is ignored with a warning."""
-    found = {}
-    for file in known_files().values():
-        try:
-            each = read_dialect(file)
-            declare(each)
-        except SpecError as fault:
-            log.logger.warning(f'dialect "{file.name}" is ignored: {fault}')
-        else:
-            found[each.name] = each
+    """Return netspec's own dialects."""
+    found = {name: read_dialect(file) for name, file in known_files().items()}
+    for each in found.values():
+        declare(each)
     return found
 
 

@@ -18,7 +18,7 @@ from exported import Arrays, assert_same, here, in_onnxruntime, onnx_model, run_
 from fresh_dialects import fresh_dialects
 from laws.export_cases import CASES, Case
 from laws.test_registry import TYPES, folder  # noqa: F401
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.dialects.files import known_files
 from netspec.dialects.layers import CLASSES
 from netspec.errors import SpecError

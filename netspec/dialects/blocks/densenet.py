@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.not_learned import NotLearned
 from netspec.exact.layout import of_one_layout
 from netspec.layers import register
@@ -73,9 +74,7 @@ class DenseBlock(NotLearned):
         for name, only in FIXED.items():
             if getattr(p, name) != only:
                 raise self.error(f"{name} must be {only}, as the fork's code takes it to be", GROUP, name)
-        for name in ("numTransition", "growthRate"):
-            if getattr(p, name) < 1:
-                raise self.error(f"{name} must be at least 1", GROUP, name)
+        check_at_least_1(self, GROUP, "numTransition", "growthRate")
         if not 0 <= p.dropout_amount < 1:
             raise self.error("dropout_amount must be at least 0 and less than 1", GROUP, "dropout_amount")
         self.steps = steps = p.numTransition

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from netspec.dialects.blocks.order import Reordered
+from netspec.dialects.checks import check_at_least_1
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
@@ -75,8 +76,7 @@ class Reorg(Layer):
         param, shape = value(self.param, "reorg_param"), bottom_shapes[0]
         self.stride: int = param.stride
         self.reverse: bool = param.reverse
-        if self.stride < 1:
-            raise self.error("stride must be given, and be at least 1", "reorg_param", "stride")
+        check_at_least_1(self, "reorg_param", "stride")
         area = self.stride**2
         fits = len(shape) == 4 and shape[1] % area == 0
         if not fits or (not self.reverse and any(size % self.stride for size in shape[2:])):

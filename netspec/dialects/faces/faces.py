@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.faces.margins import MarginProduct
 from netspec.dialects.gradients import with_gradient_of
 from netspec.layers import register
@@ -91,8 +92,7 @@ class CenterLoss(Loss, Classified):
 
     def setup(self) -> None:
         p, shape = value(self.param, "center_loss_param"), self.bottom_shapes[0]
-        if p.num_output < 1:
-            raise self.error("num_output must be at least 1", "center_loss_param", "num_output")
+        check_at_least_1(self, "center_loss_param", "num_output")
         if p.distance_type not in ("L1", "L2"):
             message = f'found "{p.distance_type}", expected "L1" or "L2"'
             raise self.error(message, "center_loss_param", "distance_type")

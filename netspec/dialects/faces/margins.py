@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.layers.contract.base import Shape, State
 from netspec.layers.loss.base import Classified
 from netspec.proto.schema import value
@@ -53,8 +54,7 @@ class MarginProduct(Classified):
 
     def setup(self) -> None:
         self.settings = p = value(self.param, self.message)
-        if p.num_output < 1:
-            raise self.error("num_output must be at least 1", self.message, "num_output")
+        check_at_least_1(self, self.message, "num_output")
         shape, self.classes = self.bottom_shapes[0], p.num_output
         self.axis = self.canonical_axis(p.axis, shape, self.message, "axis")
         self.length = torch.Size(shape[self.axis :]).numel()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.rcnn.regions import RegionPooling
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import given_fields, has, value
@@ -34,9 +35,7 @@ class ROIAlign(RegionPooling):
     def setup(self) -> None:
         group = CASCADE if CASCADE in given_fields(self.param) else ALIGN
         param = value(self.param, group)
-        for name in ("pooled_h", "pooled_w"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be at least 1", group, name)
+        check_at_least_1(self, group, "pooled_h", "pooled_w")
         self.bins, self.scale = (param.pooled_h, param.pooled_w), float(param.spatial_scale)
         self.cascade = group == CASCADE and has(param, "pad_ratio")
         self.pad_ratio = float(param.pad_ratio) if self.cascade else 0.0

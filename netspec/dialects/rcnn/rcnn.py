@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from netspec.dialects.boxes import as_array
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.rcnn.align import ROIAlign
 from netspec.dialects.rcnn.faster import AnchorTarget, ProposalTarget, RoIData, anchors_of, settings
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors, half_up, moved, suppress
@@ -78,9 +79,7 @@ class ROIPooling(RegionPooling):
 
     def setup(self) -> None:
         param = value(self.param, "roi_pooling_param")
-        for name in ("pooled_h", "pooled_w"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be at least 1", "roi_pooling_param", name)
+        check_at_least_1(self, "roi_pooling_param", "pooled_h", "pooled_w")
         self.bins = (param.pooled_h, param.pooled_w)
         self.scale: float = param.spatial_scale
         self.pad_ratio: float = param.pad_ratio
@@ -190,9 +189,7 @@ class Proposal(Layer):
     def setup(self) -> None:
         """Compute the anchors of one pixel."""
         self.settings = param = value(self.param, "proposal_param")
-        for name in ("feat_stride", "base_size", "pre_nms_topn", "post_nms_topn"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be at least 1", "proposal_param", name)
+        check_at_least_1(self, "proposal_param", "feat_stride", "base_size", "pre_nms_topn", "post_nms_topn")
         for name in ("ratio", "scale"):
             if any(number <= 0 for number in getattr(param, name)):
                 raise self.error(f"{name} must be above 0", "proposal_param", name)

@@ -11,6 +11,7 @@ import torch
 from typing_extensions import override
 
 from netspec.dialects.boxes import as_array, highest
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.layers import replace
 from netspec.dialects.rcnn.regions import RegionPooling, whole
 from netspec.dialects.rcnn.smooth import NORMALIZED, SmoothL1LossOHEM, divisor, four
@@ -60,9 +61,7 @@ class PSROIPooling(RegionPooling):
 
     def setup(self) -> None:
         param = value(self.param, "psroi_pooling_param")
-        for name in ("output_dim", "group_size"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be given and be at least 1", "psroi_pooling_param", name)
+        check_at_least_1(self, "psroi_pooling_param", "output_dim", "group_size")
         self.channels, self.bins, self.scale = param.output_dim, param.group_size, param.spatial_scale
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -165,8 +164,7 @@ class BoxAnnotatorOHEM(Layer):
 
     def setup(self) -> None:
         self.settings = value(self.param, "box_annotator_ohem_param")
-        if self.settings.roi_per_img < 1:
-            raise self.error("roi_per_img must be given and be at least 1", "box_annotator_ohem_param", "roi_per_img")
+        check_at_least_1(self, "box_annotator_ohem_param", "roi_per_img")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         full = [four(shape) for shape in bottom_shapes]

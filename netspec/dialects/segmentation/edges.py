@@ -12,10 +12,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from netspec.data.images import read_image
 from netspec.data.sources import Source
 from netspec.data.transformer import Transformer
-from netspec.dialects.segmentation.pairs import Array, Pair, PairSource, read_labels, read_pairs
+from netspec.dialects.segmentation.pairs import Array, pair_source
 from netspec.layers.contract.base import Shape
 from netspec.layers.data.files import ImageData
 from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
@@ -32,22 +31,12 @@ class EdgeMaps(ImageData):
         raise NotImplementedError
 
     def open(self) -> Source | None:
-        p, draws = self.param.image_data_param, self.draws
-        pairs = self.attempt(read_pairs, p.source, self.where)
-        transformer = self.attempt(self.transformer)
-        if pairs is None or transformer is None:
-            return None
-        cursor = self.cursor(len(pairs), p.rand_skip, p.shuffle)
-        size = (p.new_height, p.new_width) if p.new_height else None
-        root, color = p.root_folder, p.is_color
+        draws = self.draws
         bare = type(self.param.transform_param)()
         bare.CopyFrom(self.param.transform_param)
         for name in ("mean_file", "mean_value", "scale"):
             bare.ClearField(name)
         as_images = Transformer(bare, self.phase, self.context.at, draws.seed, draws.stream)  # the same random numbers
-
-        def read(pair: Pair) -> tuple[Array, Array]:
-            return read_image(root + pair.image, color, size), read_labels(root + pair.labels, size, nearest=False)
 
         def cut(image: Array, labels: Array, position: int) -> tuple[Array, Array]:
             if labels.shape[1:] != image.shape[1:]:
@@ -56,9 +45,7 @@ class EdgeMaps(ImageData):
             edges = self.edges(labels.astype(np.float32))
             return image, as_images([edges], range(position, position + 1))[0]
 
-        source = PairSource(pairs, cursor, read, cut, transformer)
-        self.log_size(source, "image_labelmap_data_layer.cpp:105")
-        return source
+        return pair_source(self, self.param.image_data_param, cut, "image_labelmap_data_layer.cpp:105")
 
     def second_shape(self, data: Shape) -> Shape:
         return (data[0], 1, *data[2:])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from netspec.data.sources import Arrays, Cursor
 from netspec.data.transformer import Transformer
 from netspec.errors import SpecError, Where
 from netspec.layers.contract.base import Shape
+from netspec.layers.data.files import ReadingLayer
 
 Array = np.ndarray
 
@@ -51,6 +53,35 @@ def read_labels(path: str, size: tuple[int, int] | None, nearest: bool) -> Array
 
     height, width = size
     return cv2.resize(read_image(path, False)[0], (width, height), interpolation=cv2.INTER_NEAREST)[None]
+
+
+def pair_source(
+    layer: ReadingLayer,
+    p: Any,
+    cut: Callable[[Array, Array, int], tuple[Array, Array]],
+    site: str,
+    of_labels: Callable[[int], int] | None = None,
+) -> PairSource | None:
+    """Return the source of a layer with the settings ``p``, None if :meth:`ReadingLayer.attempt` caught an error.
+
+    Labels are resized bilinearly like the images or, with ``of_labels``, by nearest neighbor, to the sides that it
+    returns. ``cut`` is as in :class:`PairSource`; the size of a batch is logged from ``site``.
+    """
+    pairs = layer.attempt(read_pairs, p.source, layer.where)
+    transformer = layer.attempt(layer.transformer)
+    if pairs is None or transformer is None:
+        return None
+    size = (p.new_height, p.new_width) if p.new_height else None
+    smaller = size if size is None or of_labels is None else (of_labels(size[0]), of_labels(size[1]))
+    root, color = p.root_folder, p.is_color
+
+    def read(pair: Pair) -> tuple[Array, Array]:
+        image = read_image(root + pair.image, color, size)
+        return image, read_labels(root + pair.labels, smaller, of_labels is not None)
+
+    source = PairSource(pairs, layer.cursor(len(pairs), p.rand_skip, p.shuffle), read, cut, transformer)
+    layer.log_size(source, site)
+    return source
 
 
 class PairSource:

@@ -7,13 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from typing_extensions import override
 
-from netspec.data.images import read_image
 from netspec.data.random_words import words
 from netspec.data.sources import Source
 from netspec.data.transformer import contradictions
 from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.layers import replace
-from netspec.dialects.segmentation.pairs import Array, Pair, PairSource, read_labels, read_pairs
+from netspec.dialects.segmentation.pairs import Array, pair_source
 from netspec.errors import SpecError
 from netspec.layers import register
 from netspec.layers.contract.base import Shape
@@ -84,17 +83,7 @@ class DenseImageData(ReadingLayer):
 
     def open(self) -> Source | None:
         p, draws = value(self.param, GROUP), self.draws
-        pairs = self.attempt(read_pairs, p.source, self.where)
-        transformer = self.attempt(self.transformer)
-        if pairs is None or transformer is None:
-            return None
-        cursor = self.cursor(len(pairs), p.rand_skip, p.shuffle)
-        size = (p.new_height, p.new_width) if p.new_height else None
-        smaller = None if size is None else (size[0] // p.label_divide_factor, size[1] // p.label_divide_factor)
-        crop, mirror, root, color = (p.crop_height, p.crop_width), p.mirror, p.root_folder, p.is_color
-
-        def read(pair: Pair) -> tuple[Array, Array]:
-            return read_image(root + pair.image, color, size), read_labels(root + pair.labels, smaller, nearest=True)
+        crop, mirror, less = (p.crop_height, p.crop_width), p.mirror, p.label_divide_factor
 
         def cut(image: Array, labels: Array, position: int) -> tuple[Array, Array]:
             mirrored, down, across, _ = words(draws.seed, f"{draws.stream}/cut", position, 1)[0].tolist()
@@ -108,9 +97,7 @@ class DenseImageData(ReadingLayer):
             window = (slice(None), slice(top, top + crop[0]), slice(left, left + crop[1]))
             return image[window], labels[window]
 
-        source = PairSource(pairs, cursor, read, cut, transformer)
-        self.log_size(source, "dense_image_data_layer.cpp:121")
-        return source
+        return pair_source(self, p, cut, "dense_image_data_layer.cpp:121", lambda side: side // less)
 
     def known_shape(self) -> Shape | None:
         """Return the shape if the prototxt gives height and width."""

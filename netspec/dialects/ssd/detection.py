@@ -17,6 +17,7 @@ from netspec.dialects.boxes import (
     highest,
     suppress,
 )
+from netspec.dialects.checks import check_at_least_1
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import value
@@ -49,8 +50,7 @@ class DetectionOutput(Layer):
 
     def setup(self) -> None:
         param = value(self.param, "detection_output_param")
-        if param.num_classes < 1:
-            raise self.error("num_classes must be given", "detection_output_param", "num_classes")
+        check_at_least_1(self, "detection_output_param", "num_classes")
         if param.nms_param.nms_threshold < 0:
             message = "nms_threshold must not be negative"
             raise self.error(message, "detection_output_param", "nms_param", "nms_threshold")

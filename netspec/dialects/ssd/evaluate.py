@@ -15,6 +15,7 @@ import torch
 
 from netspec import log
 from netspec.dialects.boxes import Array, as_array, highest, overlaps
+from netspec.dialects.checks import check_at_least_1
 from netspec.errors import SpecError, Where
 from netspec.files.kinds import unreadable
 from netspec.layers.contract.base import Layer, Scorer, Shape, State
@@ -47,8 +48,7 @@ class DetectionEvaluate(Layer):
 
     def setup(self) -> None:
         param = value(self.param, "detection_evaluate_param")
-        if param.num_classes < 1:
-            raise self.error("num_classes must be given", "detection_evaluate_param", "num_classes")
+        check_at_least_1(self, "detection_evaluate_param", "num_classes")
         if param.overlap_threshold <= 0:
             raise self.error("overlap_threshold must be above 0", "detection_evaluate_param", "overlap_threshold")
         if param.HasField("resize_param") and param.resize_param.resize_mode != WARP and param.name_size_file:

@@ -10,37 +10,16 @@ import numpy as np
 from typing_extensions import override
 
 from netspec.dialects.boxes import Array
-from netspec.dialects.layers import replace
 from netspec.dialects.ssd import priors
 from netspec.layers.contract.base import Shape
 from netspec.proto.schema import LayerParameter, given_fields, value
 
-DECLARATIONS = """
-message PriorBoxParameter {
-  repeated float aspect_ratio = 3;
-  optional bool flip = 4 [default = true];
-  optional bool clip = 5 [default = false];
-  repeated float variance = 6;
-  optional uint32 img_size = 7;
-  optional uint32 img_h = 8;
-  optional uint32 img_w = 9;
-  optional float step = 10;
-  optional float step_h = 11;
-  optional float step_w = 12;
-  optional float offset = 13 [default = 0.5];
-  repeated float fixed_size = 14;
-  repeated float fixed_ratio = 15;
-  repeated uint32 density = 16;
-}
-extend LayerParameter { optional PriorBoxParameter prior_box_param = 203; }
-"""
 
-
-def _is_fixed(layer: LayerParameter) -> bool:
+def is_fixed(layer: LayerParameter) -> bool:
+    """Return whether a PriorBox has boxes of fixed sizes."""
     return "fixed_size" in given_fields(value(layer, "prior_box_param"))
 
 
-@replace("PriorBox", "prior_box_param", where=_is_fixed)
 class PriorBox(priors.PriorBox):
     """Compute boxes of fixed sizes; each has density x density centers, spread over its size around the pixel's center.
 

@@ -29,6 +29,7 @@ from netspec.dialects.boxes import (
     outside,
     suppress_all,
 )
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.gradients import with_gradient_of
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.loss.base import BATCH_SIZE, FULL, VALID, normalization_mode
@@ -148,8 +149,7 @@ class MultiBoxLoss(Layer):
         """Check that the parameters are consistent."""
         self.settings: Any = value(self.param, "multibox_loss_param")
         p, field = self.settings, "multibox_loss_param"
-        if p.num_classes < 1:
-            raise self.error("num_classes must be given", field, "num_classes")
+        check_at_least_1(self, field, "num_classes")
         if p.background_label_id >= p.num_classes:
             message = f"background_label_id {p.background_label_id} is not one of the {p.num_classes} classes"
             raise self.error(message, field, "background_label_id")

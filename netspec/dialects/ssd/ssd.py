@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from netspec.dialects.blocks.normalize import Normalize
 from netspec.dialects.blocks.order import Reordered
+from netspec.dialects.layers import replace
+from netspec.dialects.ssd import faceboxes
 from netspec.dialects.ssd.annotated import AnnotatedData
 from netspec.dialects.ssd.detection import DetectionOutput
 from netspec.dialects.ssd.evaluate import DetectionEvaluate
@@ -42,6 +44,10 @@ message PriorBoxParameter {
   optional float offset = 13 [default = 0.5];
   // TextBoxes++
   optional bool denser_prior_boxes = 14 [default = false];
+  // FaceBoxes
+  repeated float fixed_size = 24;
+  repeated float fixed_ratio = 25;
+  repeated uint32 density = 26;
 }
 message NonMaximumSuppressionParameter {
   optional float nms_threshold = 1 [default = 0.3];
@@ -245,6 +251,7 @@ register(
 )(AnnotatedData)
 register("DetectionEvaluate", "detection_evaluate_param")(DetectionEvaluate)
 register("PriorBox", "prior_box_param")(PriorBox)
+replace("PriorBox", "prior_box_param", where=faceboxes.is_fixed)(faceboxes.PriorBox)
 register("DetectionOutput", "detection_output_param")(DetectionOutput)
 register("Normalize", "norm_param", "normalize_param")(Normalize)
 

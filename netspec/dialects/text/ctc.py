@@ -11,6 +11,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.gradients import with_gradient_of
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
@@ -229,10 +230,8 @@ class CtcLoss(_CtcLoss):
     bottoms = (2, 2)
 
     def setup(self) -> None:
-        self.settings = param = value(self.param, LOSS)
-        for name in ("alphabet_size", "time_step"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be given and be at least 1", LOSS, name)
+        self.settings = value(self.param, LOSS)
+        check_at_least_1(self, LOSS, "alphabet_size", "time_step")
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, labels = bottom_shapes

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.text.ctc import (
     DECODER,
     LOSS,
@@ -88,9 +89,7 @@ class ContinuationIndicator(Layer):
 
     def setup(self) -> None:
         param = value(self.param, "continuation_indicator_param")
-        for name in ("time_step", "batch_size"):
-            if getattr(param, name) < 1:
-                raise self.error(f"{name} must be given and be at least 1", "continuation_indicator_param", name)
+        check_at_least_1(self, "continuation_indicator_param", "time_step", "batch_size")
         self.size = (param.time_step, param.batch_size)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
@@ -174,8 +173,7 @@ class Lstm(Layer):
     def setup(self) -> None:
         """Add the blobs; the initial state is 0."""
         param, shape = value(self.param, "lstm_param"), self.bottom_shapes[0]
-        if param.num_output < 1:
-            raise self.error("num_output must be given and be at least 1", "lstm_param", "num_output")
+        check_at_least_1(self, "lstm_param", "num_output")
         if len(shape) not in (2, 3):
             raise self.error(f"found a bottom of shape {shape}, expected (T, N, C) or (T N, C)", "bottom", 0)
         self.size, self.clip, self.items = param.num_output, param.clipping_threshold, param.batch_size

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from netspec.dialects.checks import check_at_least_1
 from netspec.dialects.gradients import with_gradient_of
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
@@ -91,8 +92,7 @@ class Convolution3D(Convolution):
         given: Any = value(self.param, "convolution3d_param")
         if len(self.bottom_shapes[0]) != 5:
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, L, H, W)", "bottom", 0)
-        if min(given.kernel_size, given.kernel_depth) < 1:
-            raise self.error("kernel_size and kernel_depth must be given", "convolution3d_param")
+        check_at_least_1(self, "convolution3d_param", "kernel_size", "kernel_depth")
         self.param = _copied_param(self)
         param = self.param.convolution_param
         param.num_output, param.bias_term = given.num_output, given.bias_term
@@ -218,9 +218,7 @@ class Pooling3D(_VolumePooling):
         p: Any = value(self.param, self.group)
         if len(self.bottom_shapes[0]) != 5:
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, L, H, W)", "bottom", 0)
-        for name in ("kernel_size", "kernel_depth", "stride", "temporal_stride"):
-            if getattr(p, name) < 1:
-                raise self.error(f"{name} must be given and be at least 1", self.group, name)
+        check_at_least_1(self, self.group, "kernel_size", "kernel_depth", "stride", "temporal_stride")
         if p.pad and p.pool != AVE:
             raise self.error("only AVE pooling has padding", self.group, "pad")
         sides = (p.kernel_depth, p.kernel_size), (p.temporal_stride, p.stride), (0, p.pad)

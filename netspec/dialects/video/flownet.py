@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.data.mean import read_mean
+from netspec.dialects.checks import check_at_least_1
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
 from netspec.layers.contract.base import Shape
@@ -115,9 +116,7 @@ class Correlation(_OfMaps):
 
     def setup(self) -> None:
         self.settings = p = value(self.param, "correlation_param")
-        for name, least in (("kernel_size", 1), ("stride_1", 1), ("stride_2", 1)):
-            if getattr(p, name) < least:
-                raise self.error(f"{name} must be at least {least}", "correlation_param", name)
+        check_at_least_1(self, "correlation_param", "kernel_size", "stride_1", "stride_2")
         if p.kernel_size % 2 == 0 or p.single_direction or p.do_abs:
             found = f"found kernel_size {p.kernel_size}, single_direction {p.single_direction}, do_abs {p.do_abs}"
             raise self.error(f"expected an odd kernel_size, and both directions without do_abs; {found}")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fake_gpu import NAME, POSSIBLE, fake_gpu
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST

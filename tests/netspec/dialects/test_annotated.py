@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from annotated_records import annotated, write
+from netspec import use_dialect
 from netspec.data.datum import array_to_datum
-from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, layer_class

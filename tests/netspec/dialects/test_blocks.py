@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers import Layer, layer_class, layer_types

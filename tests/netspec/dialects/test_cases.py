@@ -10,7 +10,7 @@ import torch
 from case_files import read_table, sizes
 from contexts import context
 from dialect_numbers import NUMBERS, Case
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import SpecError, Where
 from netspec.layers import Context, Layer
 from netspec.net.one_layer import make_layer

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from annotated_records import annotated, write
-from netspec import load_solver
+from netspec import load_solver, use_dialect
 from netspec.cli import main
-from netspec.dialects import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Layer
 

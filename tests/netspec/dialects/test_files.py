@@ -12,8 +12,9 @@ import pytest
 import netspec
 import netspec.dialects
 from fresh_dialects import used_by
+from netspec import use_dialect
 from netspec.cli import main
-from netspec.dialects import known, use_dialect
+from netspec.dialects import known
 from netspec.dialects.files import find_file, known_files, read_dialect
 from netspec.errors import SpecError
 from netspec.layers import layer_class, layer_types
@@ -110,7 +111,7 @@ FAULTS = {
     "declarations that are none": (
         b'"""Mine."""\n\nDECLARATIONS = """\nmessage A {\n  int32 x = 1;\n}\n"""\n',
         "{path}",
-        '{path}:5:3: expected optional, repeated or required, found "int32"',
+        "{path}:5:3: expected message, enum, extend, or a field",
     ),
     "a field that Caffe has": (
         b'DECLARATIONS = "extend LayerParameter { optional int32 name = 990; }"\n',
@@ -243,44 +244,6 @@ def test_layer_types_read_from_the_source_equal_those_registered(name: str) -> N
     use_dialect(name)
     assert set(layer_types()) - before == set(declared.layer_types)
     assert declared.fields() or declared.layer_types
-
-
-# ---- Entry points ----
-
-
-@pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_files: None) -> Iterator[Path]:
-    """An installed package with three entry points: a dialect, one that does not exist, and one that is none."""
-    folder = tmp_path / "site" / "forky"
-    info = tmp_path / "site" / "forky-1.0.dist-info"
-    for made in (folder, info):
-        made.mkdir(parents=True)
-    (folder / "__init__.py").write_text("")
-    renamed = example().replace("Times", "Thrice").replace("times_param", "thrice_param").replace("1000", "1003")
-    (folder / "doubling.py").write_text(renamed)
-    (folder / "nothing.py").write_text("")
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: forky\nVersion: 1.0\n")
-    points = "doubling_too = forky.doubling\nabsent = forky.absent\nnothing = forky.nothing\n"
-    (info / "entry_points.txt").write_text(f"[netspec.dialects]\n{points}")
-    monkeypatch.syspath_prepend(tmp_path / "site")
-    yield folder
-    for name in [name for name in sys.modules if name.partition(".")[0] == "forky"]:
-        del sys.modules[name]
-
-
-@pytest.mark.usefixtures("package")
-def test_an_entry_point_of_a_package_is_used_and_invalid_ones_are_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    net = tmp_path / "net.prototxt"
-    net.write_text(NET.replace("Times", "Thrice").replace("times_param", "thrice_param"))
-    assert main(["check", str(net)]) == 0
-    error = capsys.readouterr().err
-    assert 'dialect "absent": there is no module forky.absent; the dialect is ignored' in error
-    assert 'dialect "nothing" is ignored: ' in error
-    cls = layer_class("Thrice")
-    assert cls is not None
-    assert cls.__module__ == "forky.doubling"
 
 
 # ---- Used by a whole prototxt ----

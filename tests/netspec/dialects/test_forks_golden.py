@@ -21,7 +21,8 @@ from benchmarks.pages import write
 from dialect_numbers import NUMBERS
 from fresh_dialects import fresh_dialects
 from golden_cases import LayerCase, layer_distances, parameters, set_parameters, train
-from netspec.dialects import known, use_dialect
+from netspec import use_dialect
+from netspec.dialects import known
 from netspec.errors import SpecError
 from paths import GOLDEN, ROOT
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import netspec
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import Code, SpecError
 from netspec.graph.options import BuildOptions
 from netspec.layers.vision.convolution import Convolution

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.dialects.rcnn.proposals import base_anchors, half_up
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fresh_dialects import used_by
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
 from netspec.net.build import build_net

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.dialects.boxes import CENTER_SIZE, decode, overlaps, suppress
 from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
@@ -53,7 +53,7 @@ def test_boxes_of_faceboxes_are_spread_over_their_size(build: Build, ratios: lis
     given = "".join(f"fixed_ratio: {ratio} " for ratio in ratios) or "aspect_ratio: 4 flip: false"
     settings = f"fixed_size: 32 fixed_size: 65 density: 4 density: 2 step: 32 {given}"
     bottoms = torch.zeros(1, 1, 2, 3), torch.zeros(1, 3, 64, 96)
-    layer = build("faceboxes", f"type: 'PriorBox' prior_box_param {{ {settings} }}", *(x.shape for x in bottoms))
+    layer = build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", *(x.shape for x in bottoms))
     found = layer.run(*bottoms)[0]
     expected = []
     for row, column in itertools.product(range(2), range(3)):
@@ -84,7 +84,7 @@ def test_boxes_of_faceboxes_and_of_ssd_may_be_in_one_net(net_of: Callable[..., N
 )
 def test_wrong_boxes_of_faceboxes_are_refused(build: Build, settings: str, column: int) -> None:
     with pytest.raises(SpecError) as caught:
-        build("faceboxes", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2), (1, 1, 2, 2))
+        build("ssd", f"type: 'PriorBox' prior_box_param {{ {settings} }}", (1, 1, 2, 2), (1, 1, 2, 2))
     assert caught.value.where is not None
     assert (caught.value.where.type, caught.value.where.column) == ("PriorBox", column)
 

@@ -20,7 +20,7 @@ from exported import (
     source_module,
     trained,
 )
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import SpecError
 from netspec.export.formats.shapes import find_shapes
 from netspec.net.net import Net

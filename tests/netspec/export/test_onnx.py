@@ -23,7 +23,7 @@ from exported import (
     source_module,
     trained,
 )
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import SpecError
 from netspec.export.formats.onnx import export_onnx
 from netspec.export.formats.preprocess import Preprocess

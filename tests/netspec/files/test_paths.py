@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from netspec.dialects import use_dialect
+from netspec import use_dialect
 from netspec.errors import SpecError
 from netspec.files.image_list import list_images
 from netspec.files.paths import relative

@@ -8,10 +8,11 @@ import sys
 import pytest
 from google.protobuf import descriptor_pool, text_format
 
+from netspec import use_dialect
 from netspec.compat.pycaffe.net_spec import layers, params
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.compat.scripts.program import advice_on_dialects
-from netspec.dialects import known, use_dialect
+from netspec.dialects import known
 from netspec.proto import schema
 
 

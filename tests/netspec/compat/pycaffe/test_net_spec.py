@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from netspec import use_dialect
 from netspec.compat.pycaffe.net_spec import NetSpec, to_proto
 from netspec.compat.pycaffe.net_spec import layers as L
 from netspec.compat.pycaffe.net_spec import params as P
 from netspec.compat.pycaffe.proto import caffe_pb2
-from netspec.dialects import use_dialect
 from netspec.net.build import build_net
 from netspec.proto.text import parse_net_text
 

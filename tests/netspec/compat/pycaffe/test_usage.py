@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
+from netspec import use_dialect
 from netspec.compat.scripts import finder
-from netspec.dialects import use_dialect
 
 pytestmark = pytest.mark.slow
 

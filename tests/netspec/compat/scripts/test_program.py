@@ -15,9 +15,9 @@ import pytest
 
 import netspec
 from dnn_program import HERE
+from netspec import use_dialect
 from netspec.data.database import Writer
 from netspec.data.datum import array_to_datum
-from netspec.dialects import use_dialect
 from netspec.net.weights import write_binary
 
 pytestmark = pytest.mark.slow
