@@ -14,16 +14,10 @@ PYTHON_LAYERS = ROOT / "tests" / "python_layers.py"  # a module of them
 SHARED = Path(os.environ.get("NETSPEC_SHARED", ROOT.parent / "shared"))
 
 
-# Nets that differ from another one in their depth or in the size of their last layer alone.
-_ALIKE = ("SENet-154", "SE-ResNet-152", "SE-ResNet-101", "SE-ResNeXt-101", "ResNet-152-deploy", "ResNet-101-deploy")
-_ALIKE_IN_OURS = ("siamese_128", "siamese_resnet27_512")
-
-
 def nets_as_found() -> list[Path]:
-    """Return the prototxts of the project's nets, and of public nets if they are there, one of each kind."""
-    found = sorted(path for path in (ROOT / "prototxt").rglob("*.prototxt") if path.parent.name not in _ALIKE_IN_OURS)
-    found += sorted(path for path in (SHARED / "corpus").rglob("*.prototxt") if path.stem not in _ALIKE)
-    return [path for path in found if "solver" not in path.name]
+    """Return the prototxts of the project's nets, and of public nets if they are there; larger ones repeat blocks."""
+    found = [*(ROOT / "prototxt").rglob("*.prototxt"), *(SHARED / "corpus").rglob("*.prototxt")]
+    return sorted(path for path in found if "solver" not in path.name and path.stat().st_size < 20_000)
 
 
 def last_parts(path: Path) -> str:

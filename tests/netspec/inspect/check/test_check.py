@@ -99,18 +99,6 @@ def test_check_reports_the_errors_of_train(run: Run, case: dict[str, str]) -> No
     assert not any(message.startswith("Iteration ") for message in trained.messages)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("files")
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_check_finds_errors_of_prototxts_without_data(
-    run: Run, case: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    faults = write_case(case)
-    for opens in ("layers.data.files.open_reader", "layers.data.files.read_image_list", "data.transformer.read_mean"):
-        monkeypatch.setattr(f"netspec.{opens}", lambda *_: pytest.fail("data was opened"))
-    assert begin_with(without_warnings(run("check", "s.prototxt").err), faults)
-
-
 FILLED_BY_SCRIPT = {
     "Input": (
         'layer { name: "in" type: "Input" top: "data" input_param { shape { dim: 4 dim: 3 } } }',

@@ -178,15 +178,6 @@ def test_settings_that_the_policy_and_the_type_do_not_read_are_found(
     assert advice(in_phases(siamese()), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
 
 
-def test_settings_that_each_policy_reads_have_no_findings(advice: Callable[..., list[str]]) -> None:
-    for policy in (
-        'lr_policy: "step" gamma: 0.1 stepsize: 10', 'lr_policy: "exp" gamma: 0.9', 'lr_policy: "poly" power: 2',
-        'lr_policy: "inv" gamma: 0.1 power: 1', 'lr_policy: "multistep" gamma: 0.1 stepvalue: 9',
-        'lr_policy: "sigmoid" gamma: 0.1 stepsize: 50',
-    ):  # fmt: skip
-        assert advice(in_phases(siamese()), SOLVER.replace('lr_policy: "fixed"', policy)) == []
-
-
 @pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
 def test_a_test_iter_far_from_the_size_of_the_database_is_found(
     advice: Callable[..., list[str]], iterations: int, far: bool

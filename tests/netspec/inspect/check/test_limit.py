@@ -12,13 +12,10 @@ import torch
 from google.protobuf import text_format
 
 from netspec.cli import main
-from netspec.data.images import read_image
 from netspec.errors import SpecError
 from netspec.files import limits
-from netspec.graph import splits
 from netspec.layers.contract import fillers
 from netspec.layers.contract.base import Shape
-from netspec.load import load_solver
 from netspec.net.assembly import limit_on
 from netspec.net.net import Net
 from netspec.proto.schema import TEST, TRAIN, LayerParameter
@@ -85,20 +82,6 @@ def test_nets_above_the_limit_are_refused_by_every_command(
     assert sum(filled) == 0
 
 
-@pytest.mark.parametrize(
-    ("said", "is_memory"),
-    [
-        ("[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate memory: you tried", True),
-        ("CUDA out of memory. Tried to allocate 2.00 GiB", True),
-        ("Storage size calculation overflowed with sizes=[4611686018427387904, 2]", True),
-        ("numel: integer multiplication overflow", True),
-        ("cannot allocate a worker: the pool is closed", False),
-    ],
-)
-def test_only_torchs_own_words_mean_that_memory_ran_out(said: str, is_memory: bool) -> None:
-    assert limits.is_out_of_memory(RuntimeError(said)) == is_memory
-
-
 def test_torch_still_says_so_in_these_words() -> None:
     for size in (2**62, 2**45):
         with pytest.raises(RuntimeError) as fault:
@@ -157,16 +140,6 @@ def test_data_layers_above_the_limit_are_refused(command: str, kind: str, capsys
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith('net.prototxt:1:1: layer "data" (ImageData): ')
     assert said in last
-
-
-def test_an_image_that_cannot_be_resized_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_memory(*arguments: object, **named: object) -> None:
-        raise cv2.error("Failed to allocate")
-
-    cv2.imwrite("a.png", np.zeros((40, 40, 3), np.uint8))
-    monkeypatch.setattr(cv2, "resize", no_memory)
-    with pytest.raises(ValueError, match=r'"a.png" cannot be resized to 8 x 9'):
-        read_image("a.png", size=(8, 9))
 
 
 @pytest.mark.parametrize("text", ["pad: 2000000000 dilation: 2000000000", "pad: 40000000 dilation: 40000000"])
@@ -228,20 +201,6 @@ def test_the_message_lists_the_parts_of_the_sum(capsys: pytest.CaptureFixture[st
     assert "\nmemory: at least 239 MiB: parameters 239 MiB, tops 477 KiB\n" in capsys.readouterr().out
 
 
-def test_the_limit_is_checked_before_memory_is_filled(net_of: Callable[..., Net], filled: list[int]) -> None:
-    """Each layer is below the limit, their sum is not."""
-    layers = "".join(
-        f'layer {{ name: "ip{i}" type: "InnerProduct" bottom: "data" top: "ip{i}" param {{ name: "w{i}" }} '
-        "inner_product_param { num_output: 1024 bias_term: false } }\n"
-        for i in range(10)
-    )
-    data = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 1024 } } }\n'
-    with pytest.raises(SpecError, match="needs at least 40") as caught:
-        net_of(data + layers, limit=20 * MIB)
-    assert 'layer "ip0"' in str(caught.value)
-    assert sum(filled) == 0
-
-
 def test_shared_parameters_count_once(net_of: Callable[..., Net]) -> None:
     layers = "".join(
         f'layer {{ name: "ip{i}" type: "InnerProduct" bottom: "data" top: "ip{i}" param {{ name: "w" }} '
@@ -257,11 +216,6 @@ def test_tops_count_until_their_last_use_in_phase_test(net_of: Callable[..., Net
     assert net_of(CHAIN, phase=TRAIN).need.tops == 11 * 4 * MIB
     in_place = CHAIN.replace('top: "1" }', 'top: "0" }').replace('bottom: "1"', 'bottom: "0"')
     assert net_of(in_place, phase=TRAIN).need.tops == 10 * 4 * MIB
-
-
-def test_splits_need_no_memory(net_of: Callable[..., Net]) -> None:
-    text = CHAIN + 'layer { name: "e" type: "Eltwise" bottom: "0" bottom: "10" top: "e" }\n'
-    assert net_of(text, phase=TEST).need.tops == 3 * 4 * MIB  # that of blob 0 lives to the end
 
 
 @pytest.mark.parametrize(
@@ -284,33 +238,3 @@ def test_the_memory_of_a_container_is_used(tmp_path: Path, monkeypatch: pytest.M
     assert limits.memory() == MIB
     (tmp_path / "memory.max").write_text("max\n")
     assert limits.memory() >= machine
-
-
-@pytest.mark.slow
-def test_a_training_within_the_limit_runs() -> None:
-    Path("net.prototxt").write_text(DUMMY)
-    assert load_solver("solver.prototxt", limit=600 * MIB).net.need.tops == 4 * 64_000_000 + 4
-
-
-# Checking large nets takes little time
-INPUT = 'input: "data" input_dim: 1 input_dim: 3 input_dim: 8 input_dim: 8\n'
-
-
-def unknown(count: int) -> str:
-    layers = (f'layer {{ name: "r{i}" type: "ReLU" bottom: "b{i}" top: "r{i}" }}\n' for i in range(count))
-    return INPUT + "".join(layers)
-
-
-def test_an_error_in_a_large_net_names_the_last_blobs(net_of: Callable[..., Net]) -> None:
-    faults: list[SpecError] = []
-    net_of(unknown(100), report=faults.append)
-    assert "unknown bottom blob" in str(faults[99])
-    assert f"available: {100 - splits.MOST_NAMES} more, r{99 - splits.MOST_NAMES}, " in str(faults[99])
-
-
-def test_the_number_of_suggestions_is_limited(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each search takes time for each blob there is: for 10,000 unknown blobs, minutes."""
-    asked: list[str] = []
-    monkeypatch.setattr(splits, "did_you_mean", lambda blob, known: asked.append(blob) or "")
-    net_of(unknown(100), report=lambda fault: None)
-    assert len(asked) == splits.MOST_HINTS

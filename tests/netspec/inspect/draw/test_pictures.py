@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from netspec.cli import main
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError
 from netspec.graph.options import BuildOptions
 from netspec.inspect.draw.blocks import find_blocks
-from netspec.inspect.draw.diagram import Box, Diagram, diagram_of, kind_of, settings_text
-from netspec.inspect.draw.dot import COLORS, color_of, dot_of
+from netspec.inspect.draw.diagram import Diagram, diagram_of
+from netspec.inspect.draw.dot import dot_of
 from netspec.inspect.draw.graphviz import render
-from netspec.inspect.draw.page import net_page
-from netspec.layers import layer_types
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net, parse_net_text
 from paths import last_parts, nets_as_found
@@ -113,10 +111,6 @@ def test_boxes_show_the_settings_of_layers() -> None:
     assert "46.7 k mult-adds · 584 weights" in words
 
 
-def test_every_layer_type_has_a_color() -> None:
-    assert [name for name in layer_types() if color_of(kind_of(name)) == COLORS[""]] == []
-
-
 def test_an_in_place_layer_on_a_shared_blob_has_its_own_box() -> None:
     text = INPUT + conv("c", "data") + layer("p", "Pooling", "c", "p", "pooling_param { kernel_size: 3 }")
     diagram = read(text + layer("r", "ReLU", "c", "c") + layer("q", "Sigmoid", "c", "q"))
@@ -131,20 +125,6 @@ def test_a_net_that_cannot_be_built_is_drawn_without_shapes() -> None:
     assert boxes_in(svg_of(diagram)) == [0, 1]
     assert boxes_in(svg_of(read('name: "empty"'))) == []
     assert [box.name for box in read('layer { name: "s" type: "Silence" bottom: "no" }').boxes] == ["s"]
-
-
-@pytest.mark.parametrize(
-    ("param", "words"),
-    [
-        ("convolution_param { num_output: 4 kernel_h: 3 kernel_w: 1 stride: 1 pad_h: 1 }", "3×1, 4, pad 1×0"),
-        ("pooling_param { pool: AVE global_pooling: true }", "AVE, global pooling"),
-        ("lrn_param { local_size: 3 alpha: 0.1 engine: CAFFE }", "local size 3, alpha 0.1"),
-    ],
-    ids=["convolution_param", "pooling_param", "lrn_param"],
-)
-def test_settings_text_abbreviates_the_fields(param: str, words: str) -> None:
-    net, _ = parse_net_text(layer("x", "X", "a", "b", param), "f")
-    assert settings_text(net.layer[0]) == words
 
 
 @pytest.mark.slow
@@ -168,37 +148,12 @@ def test_draw_writes_svg_html_and_png(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["draw", str(tmp_path / "none.prototxt"), "--out", str(tmp_path / "net.svg")]) == 1
 
 
-def test_the_page_has_no_font_below_9_pixels_on_a_phone() -> None:
-    """At first the page shows the picture at 0.9 of its size or more, so that 10 pixels become 9 at least."""
-    page = net_page(read(residual(3) + layer("only", "ReLU", "end", "only", "include { phase: TEST }")))
-    sizes = [float(size) for size in re.findall(r'font-size="([\d.]+)"', page)]
-    assert "TEST" in page
-    assert min(sizes) >= 10
-    assert "Math.max(0.9" in page
-    assert "prefers-color-scheme: dark" in page
-    assert "a click on a box" in page
-
-
 def test_a_solver_is_drawn_by_its_training_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("net.prototxt").write_text('name: "trained"\n' + residual(1))
     Path("solver.prototxt").write_text('net: "net.prototxt" base_lr: 1 lr_policy: "fixed"')
     assert main(["draw", "solver.prototxt", "--out", "net.svg"]) == 0
     assert "trained" in Path("net.svg").read_text()
-
-
-def test_names_are_escaped_in_markup() -> None:
-    diagram = Diagram(
-        "<b>", (Box("<i>\x1b", "T&", "", "", (), Where("f"), "<", ""),), ((),), (("<u>",),), (SpecError("x"),)
-    )
-    for text in (render(dot_of(diagram), "svg").decode(), net_page(diagram)):
-        assert not re.search(r"<[biu]>|\x1b", text)
-
-
-def test_layers_of_equal_names_are_separate_nodes() -> None:
-    text = INPUT + layer("a", "ReLU", "data", "b", "include { phase: TRAIN }")
-    text += layer("a", "Sigmoid", "data", "b", "include { phase: TEST }") + layer('q\\"\\\\', "TanH", "b", "c")
-    assert boxes_in(svg_of(read(text))) == [0, 1, 2, 3]
 
 
 def test_a_missing_graphviz_is_reported_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:

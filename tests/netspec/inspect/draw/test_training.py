@@ -45,17 +45,6 @@ def test_nan_losses_are_marked() -> None:
     assert list(marks.get_xdata()) == [1, 2]  # pyright: ignore[reportArgumentType]
 
 
-def test_a_few_large_losses_do_not_determine_the_scale() -> None:
-    curve = Curve(list(range(100)), [80.0] + [1 + 0.01 * (k % 10) for k in range(99)])
-    assert training_figure([TrainingLog("x", curve)]).axes[0].get_ylim()[1] < 2
-
-
-def test_test_losses_far_above_the_training_loss_are_in_the_range() -> None:
-    run = TrainingLog("x", Curve(list(range(100)), [1 + 0.01 * (k % 10) for k in range(100)]), losses={"loss"})
-    run.tests[0] = {"loss": Curve([50], [3.0])}
-    assert training_figure([run]).axes[0].get_ylim()[1] > 3
-
-
 @pytest.mark.slow
 def test_plot_writes_png_and_svg(run: Run_) -> None:
     for ending in ("png", "svg"):
@@ -65,13 +54,6 @@ def test_plot_writes_png_and_svg(run: Run_) -> None:
     assert cv2.imread("x.png") is not None
     texts = {text.text for text in ET.parse("x.svg").iter("{http://www.w3.org/2000/svg}text")}
     assert {"<a> & $b_1$", "loss", "learning rate", "iteration"} <= texts
-
-
-def test_equal_names_are_distinguished_by_their_folders(run: Run_) -> None:
-    for folder in "ab":
-        Path(folder).mkdir()
-        Path(folder, "train.log").write_bytes(CAFFES.read_bytes())
-    assert run("plot", "a/train.log", "b/train.log", "--out", "x.svg").out.startswith("a/train.log: state")
 
 
 @pytest.mark.parametrize(
@@ -95,14 +77,3 @@ def test_log_scale_without_a_positive_loss_gets_a_warning(run: Run_) -> None:
     Path("x.log").write_text("Iteration 0, loss = -1\nIteration 10, loss = -2\n")
     result = run("plot", "x.log", "--out", "x.svg", "--log_scale")
     assert (result.status, result.err) == (0, "warning: no loss is above 0: its axis is not logarithmic\n")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", ["png", "svg"])
-def test_unprintable_names_are_escaped(run: Run_, ending: str) -> None:
-    name = "caf\udce9\x1b.log"
-    Path(name).write_bytes(CAFFES.read_bytes())
-    result = run("plot", name, "--out", f"x.{ending}")
-    assert result.out.startswith("caf\\udce9\\x1b.log: state done")
-    if ending == "svg":
-        assert "caf\\udce9\\x1b.log" in "".join(ET.parse("x.svg").getroot().itertext())

@@ -1,6 +1,5 @@
 """Logs of trainings, of several versions of Caffe and of netspec: what is read, smoothed and shown."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from netspec.inspect.logs.training_log import (
     iterations_per_second,
     read_log,
     shown_range,
-    smoothed,
     summary,
     thinned,
 )
@@ -146,13 +144,6 @@ def test_other_files_than_logs_are_refused(tmp_path: Path, data: bytes | None, w
         read_log(path)
 
 
-def test_smoothing_is_the_mean_of_the_finite_neighbors() -> None:
-    values = np.array([1, 2, np.nan, 4, np.inf, 6.0])
-    np.testing.assert_allclose(smoothed(values, 3), [1.5, 1.5, 3, 4, 5, 6])
-    np.testing.assert_array_equal(smoothed(values, 1)[:2], [1, 2])
-    assert np.isnan(smoothed(values, 1)[2])
-
-
 def test_thinning_keeps_extremes_and_ends() -> None:
     x = np.arange(10000.0)
     y = np.sin(x)
@@ -170,32 +161,3 @@ def test_shown_range_ignores_early_outliers_and_contains_all_other_curves() -> N
     assert shown_range([loss, np.array([5.0, 6.0])]) == (1, pytest.approx(9.0))
     assert shown_range([np.array([80.0, 1, 2])]) == (1, 80)
     assert shown_range([np.full(3, np.nan)]) is None
-
-
-@pytest.mark.parametrize("digits", [11, 400, 5000])
-def test_numbers_beyond_32_bits_are_ignored(digits: int) -> None:
-    """Caffe's counts are ints of 32 bits, its losses floats of 32 bits."""
-    long = "9" * digits
-    run = read(
-        "Iteration 10, loss = 1",
-        f"Iteration {long}, loss = 0.5",
-        f"Iteration {long}, lr = 0.1",
-        f"Iteration {long}, Testing net (#{long})",
-        f"Test net output #{long}: accuracy = 0.5",
-        "Iteration 20, loss = 1e308",
-    )
-    assert (run.loss.iterations, run.loss.values) == ([10, 20], [1, float("inf")])
-    assert (len(run.rate), run.tests) == (0, {})
-
-
-def test_a_log_can_be_read_from_a_pipe(tmp_path: Path) -> None:
-    reader, writer = os.pipe()
-    os.write(writer, CAFFES.read_bytes())  # less than a pipe holds
-    os.close(writer)
-    run = read_log(f"/dev/fd/{reader}")
-    os.close(reader)
-    assert run.loss.iterations[:2] == [0, 10]
-
-
-def test_smoothing_window_can_be_larger_than_the_curve() -> None:
-    assert smoothed(np.array([1.0, 3.0]), 10**30).tolist() == [2, 2]
