@@ -83,7 +83,7 @@ def _add_detect(commands: Commands) -> None:
         "--least-precision",
         type=float,
         metavar="P",
-        help=f"required share of correct loops (default: {PRECISION:g})",
+        help=f"share of the loops that are correct, by the estimate of what chance finds (default: {PRECISION:g})",
     )
     exclusive.add_argument(
         "--threshold",
