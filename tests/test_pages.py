@@ -19,7 +19,7 @@ import torch
 import playground
 from documents import DOCUMENTS, PROGRAMS, Command, blocks, commands, run, run_snippet
 
-EXTRAS = ("onnx", "onnxruntime", "openvino", "rosbags", "shtab", "tensorboard")
+EXTRAS = ("onnx", "onnxruntime", "openvino", "rosbags", "tensorboard")
 MISSING = [name for name in EXTRAS if find_spec(name) is None]
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from netspec.cli import caffe, caffe_tools, data, export, nets, run_script, shell
+from netspec.cli import caffe, caffe_tools, data, export, nets, run_script
 from netspec.terminal.commands import run
 from netspec.terminal.parser import Commands, Parser, program
 
@@ -16,7 +16,6 @@ _GROUPS = {
     "inspect data and trainings": [data],
     "features and other formats": [export],
     "programs written for pycaffe": [run_script],
-    "other commands": [shell],
 }
 
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 import argparse
 import logging
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
-from pathlib import Path
 from typing import Any
 
 from netspec.errors import did_you_mean
@@ -27,34 +25,6 @@ TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 CAFFES_LOG = {"log_level": logging.INFO, "log_form": GlogFormatter()}
 QUIET = {"log_level": logging.WARNING, "log_form": logging.Formatter("warning: %(message)s")}
 NO_LOG = {"log_level": logging.WARNING, "log_form": None}
-
-# Caffe's commands accept each other's flags, and glog's. A command without such a flag accepts it, and prints that it
-# has no effect, so that scripts for Caffe run.
-_CAFFES_COMMANDS = ("train", "test", "time", "device_query")
-_CAFFES_FLAGS = (
-    "gpu",
-    "solver",
-    "model",
-    "phase",
-    "level",
-    "stage",
-    "snapshot",
-    "weights",
-    "iterations",
-    "sigint_effect",
-    "sighup_effect",
-)
-_GLOGS_FLAGS = (
-    "v",
-    "vmodule",
-    "stderrthreshold",
-    "logbuflevel",
-    "logbufsecs",
-    "max_log_size",
-    "log_link",
-    "logfile_mode",
-)
-_GLOGS_SWITCHES = ("colorlogtostderr", "log_prefix", "stop_logging_if_full_disk", "log_backtrace_at")
 
 
 def program(name: str, description: str) -> Parser:
@@ -95,7 +65,7 @@ class Parser(argparse.ArgumentParser):
         """Translate gflags' spellings, then parse as argparse does; an unknown option is an error with a suggestion."""
         if self._has_commands:
             return super().parse_known_args(args, namespace)
-        words = [self._translated(word) for word in self._without_effect(list(args or ()))]
+        words = [self._translated(word) for word in args or ()]
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}{self._suggestion(unknown)}")
@@ -111,32 +81,6 @@ class Parser(argparse.ArgumentParser):
             hint = did_you_mean(value, list(action.choices)) or f"; see {self.prog} --help"
             self.error(f'there is no command "{value}"{hint}')
         super()._check_value(action, value)
-
-    def _without_effect(self, words: list[str]) -> Iterator[str]:
-        """Yield the words, with those of a ``-flagfile``, without the flags of Caffe and glog that have no effect."""
-        caffes = _CAFFES_FLAGS if self.prog.split()[-1] in _CAFFES_COMMANDS else ()
-        own = {name.lstrip("-") for name in self._option_string_actions}
-        while words:
-            word = words.pop(0)
-            name, equals, value = word.lstrip("-").partition("=")
-            if not word.startswith("-") or word == "--" or name in own:
-                yield word
-                if word == "--":
-                    yield from words
-                    return
-            elif name == "flagfile":
-                path = value if equals else words.pop(0) if words else ""
-                try:
-                    lines = Path(path).read_text("utf-8", "replace").splitlines()
-                except OSError as fault:
-                    self.error(f"-flagfile {path}: {fault.strerror}")
-                words = [line.strip() for line in lines if line.strip().startswith("-")] + words
-            elif name in _GLOGS_FLAGS + caffes or name.removeprefix("no") in _GLOGS_SWITCHES:
-                if not equals and name in _GLOGS_FLAGS + caffes and words:
-                    words.pop(0)
-                print(f"{self.prog}: -{name} is a flag of Caffe or glog that has no effect here", file=sys.stderr)
-            else:
-                yield word
 
     def _suggestion(self, unknown: Sequence[str]) -> str:
         """Return a suggestion for the first unknown option."""

@@ -49,7 +49,6 @@ WAYS = {
         "upgrade_net_proto_binary init.caffemodel new.caffemodel",
         "upgrade_solver_proto_text solver.prototxt new.prototxt",
         "layers",
-        "completion bash",
         "install-caffe --build tree",
         "remove-caffe --build tree",
     ],

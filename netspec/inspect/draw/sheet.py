@@ -1,153 +1,99 @@
-"""Draws a sheet of records: images with keys and labels, statistics of the database, and its errors."""
+"""Draws records of a database: their images, keys and labels."""
 
 from __future__ import annotations
 
 import textwrap
-from collections import Counter
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.ticker import MaxNLocator
 
-from netspec.files.figures import COLORS, PALE
-from netspec.inspect.check.survey import Survey, as_lines
-from netspec.inspect.draw.style import (
-    FAULT,
-    STYLE,
-    as_picture,
-    draw_tile,
-    images_in,
-    split,
-    text_at,
-    what_is_shown,
-)
-from netspec.inspect.records import Record
+from netspec.data.database import Reader
+from netspec.data.datum import datum_to_array, parse_datum
+from netspec.data.random_words import words
+from netspec.errors import SpecError, printable
+from netspec.inspect.draw.style import FAULT, STYLE
 
-WIDTH, HEAD = 12.0, 2.1  # inches
-LONGER, CAPTION, GAP = 1.4, 0.44, 0.14  # inches: a tile's longer side, the two lines below it, between tiles
-SEAM = 0.04  # inches between the images of one record
-LINE = 0.155  # inches
-CHANNEL_COLORS = {1: ("#555555",), 2: ("#0072B2", "#D55E00"), 3: ("#2b5fd9", "#2e8b3d", "#c62828")}  # blue, green, red
+WIDTH, TALL, LINES, GAP = 12.0, 1.4, 0.36, 0.14  # inches: the sheet, a tile, the two lines above it, between tiles
+NARROWEST, WIDEST = 0.7, 4.0  # inches: a tile
+LONGEST = 22  # characters of a key, of which the end is drawn
 
 
-def sheet(records: Sequence[Record], found: Survey, name: str, images: int | None = None) -> Figure:
-    """Draw records as tiles below the statistics that :func:`netspec.inspect.check.survey.survey` found.
+class Record(NamedTuple):
+    """A record: its key, values (C, H, W), and label, or, if it cannot be read, the reason."""
 
-    ``images`` is the number of images in a record, drawn side by side; the default is two for 2 or 6 channels.
+    key: str
+    values: np.ndarray | None
+    label: int | None
+    fault: str = ""
+
+
+def read_record(reader: Reader, number: int) -> Record:
+    """Return a record of a database, which may be damaged."""
+    key, label = reader.key(number).decode(errors="backslashreplace"), None
+    try:
+        datum: Any = parse_datum(reader.record(number))
+        label = datum.label if datum.HasField("label") else None
+        return Record(key, datum_to_array(datum), label)
+    except (SpecError, ValueError) as fault:
+        return Record(key, None, label, getattr(fault, "message", str(fault)))
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """Return ``wanted`` of the numbers below ``count``, one from each of ``wanted`` equal parts; or all.
+
+    Each is drawn at random from its part, with a fixed seed, since labels often alternate.
     """
-    usual = _usual(records)
-    side_by_side = images or (1 if usual is None else images_in(usual))
-    size = _tile_size(usual)
-    width, tall = side_by_side * (size[0] + SEAM) - SEAM, size[1]
-    columns = max(1, int((WIDTH + GAP) / (width + GAP)))
+    if wanted >= count:
+        return list(range(count))
+    ends = [k * count // wanted for k in range(wanted + 1)]
+    draws = words(0, "spread", 0, wanted)[:, 0].tolist()
+    return [low + draw % (high - low) for low, high, draw in zip(ends, ends[1:], draws, strict=False)]
+
+
+def picture(values: np.ndarray) -> np.ndarray:
+    """Return values (C, H, W) as brightness (H, W) or (H, W, 3), 0 to 1; those of 2 or 6 channels as two images.
+
+    Bytes are not scaled; other values are scaled from the minimum (black) to the maximum (white). Three channels are
+    blue, green, red, as in OpenCV; of other numbers, the mean is drawn. A vector becomes a block.
+    """
+    if values.shape[1:] == (1, 1):
+        vector = values.reshape(-1)
+        side = int(np.ceil(np.sqrt(len(vector))))
+        values = np.pad(vector, (0, side * side - len(vector)), mode="minimum").reshape(1, side, side)
+    shown = values.astype(np.float64)
+    if values.dtype != np.uint8:
+        low, high = (float(end(shown[np.isfinite(shown)], initial=0)) for end in (np.min, np.max))
+        shown = np.nan_to_num((shown - low) / ((high - low) or 1), posinf=0, neginf=0) * 255
+    images = np.split(shown / 255, 2) if len(shown) in (2, 6) else [shown / 255]
+    drawn = [image[2::-1].transpose(1, 2, 0) if len(image) in (3, 4) else image.mean(axis=0) for image in images]
+    seam = np.ones_like(drawn[0][:, : max(1, drawn[0].shape[1] // 24)])
+    return np.hstack([drawn[0], *(part for image in drawn[1:] for part in (seam, image))])
+
+
+def sheet(records: Sequence[Record], title: str) -> Figure:
+    """Draw records as tiles below a title."""
+    pictures = [None if record.values is None else picture(record.values) for record in records]
+    shape = next((each.shape for each in pictures if each is not None), (1, 1))
+    wide = min(max(TALL * shape[1] / shape[0], NARROWEST), WIDEST)
+    columns = max(1, int(WIDTH / (wide + GAP)))
     rows = -(-len(records) // columns)
-    lines = [*((line, "black") for line in as_lines(found, name)), *_fault_lines(found)]
-    note = "" if usual is None else what_is_shown(split(usual, side_by_side)[0])
-    lines += [(f"shown: {note}", "black")] if note else []
-    wrapped = [(part, color) for line, color in lines for part in textwrap.wrap(line, 88, subsequent_indent="    ")]
-    head = max(HEAD, LINE * (len(wrapped) + 2))
-    height = head + rows * (tall + CAPTION + GAP) + GAP
+    height = rows * (TALL + LINES + GAP) + 2 * LINES
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH + 2 * GAP, height))
-        whole = figure.add_axes((0, 0, 1, 1))
-        whole.set_axis_off()
-        _draw_head(figure, whole, wrapped, found, height, head)
-        for number, record in enumerate(records):
-            row, column = divmod(number, columns)
-            left = GAP + column * (width + GAP)
-            bottom = height - head - (row + 1) * (tall + CAPTION + GAP) + CAPTION
-            _draw_record(whole, record, left, bottom, side_by_side, size)
-        whole.set_xlim(0, WIDTH + 2 * GAP)
-        whole.set_ylim(0, height)
+        figure = Figure(figsize=(columns * (wide + GAP), height))
+        figure.text(0.01, 1 - LINES / 2 / height, printable(title), va="center", weight="bold", parse_math=False)
+        axes = figure.subplots(rows, columns, squeeze=False)
+        figure.subplots_adjust(0.01, 0.02, 0.99, 1 - 2 * LINES / height, GAP / wide, (LINES + GAP) / TALL)
+        for axis in axes.flat:
+            axis.set_axis_off()
+        for axis, record, drawn in zip(axes.flat, records, pictures, strict=False):
+            label = "no label" if record.label is None else f"label {record.label}"
+            axis.set_title(f"{label}\n{printable(record.key)[-LONGEST:]}", fontsize=7.5, parse_math=False)
+            if drawn is None:
+                text = textwrap.fill(printable(record.fault), int(wide * 12))
+                axis.text(0.5, 0.5, text, fontsize=7.5, color=FAULT, ha="center", va="center", parse_math=False)
+            else:
+                axis.imshow(drawn, cmap="gray", vmin=0, vmax=1)
         return figure
-
-
-def _usual(records: Sequence[Record]) -> np.ndarray | None:
-    """Return the values of a record with the most frequent shape; None if no record can be read."""
-    by_shape = {record.values.shape: record.values for record in records if record.values is not None}
-    counts = Counter(record.values.shape for record in records if record.values is not None)
-    return by_shape[counts.most_common(1)[0][0]] if counts else None
-
-
-def _tile_size(usual: np.ndarray | None) -> tuple[float, float]:
-    """Return the width and the height of a tile [inches] for images in the form of the usual one."""
-    if usual is None or usual.shape[1:] == (1, 1):
-        return LONGER, LONGER
-    height, width = usual.shape[1:]
-    scale = LONGER / max(height, width)
-    return max(width * scale, LONGER / 4), max(height * scale, LONGER / 4)
-
-
-def _fault_lines(found: Survey) -> list[tuple[str, str]]:
-    """Return the lines about the errors, with their colors."""
-    if not found.num_faults:
-        return [("errors: none", "black")]
-    count = "1 record" if found.num_faults == 1 else f"{found.num_faults:,} records"
-    examples = [(f"  {fault.key}: {fault.text}", "black") for fault in found.faults[:3]]
-    return [(f"errors: {count} that a data layer refuses", FAULT), *examples]
-
-
-def _draw_head(
-    figure: Figure, whole: Axes, lines: Sequence[tuple[str, str]], found: Survey, height: float, head: float
-) -> None:
-    for number, (line, color) in enumerate(lines):
-        weight = "bold" if number == 0 else "normal"
-        y = height - GAP - LINE * (number + 1)
-        text_at(whole, GAP, y, line, fontsize=8.5, color=color, fontweight=weight)
-    bottom = (height - min(head, HEAD) + 0.5) / height
-    tall = (min(head, HEAD) - 0.9) / height
-    if 1 < len(found.labels) <= 1000:
-        _draw_labels(figure.add_axes((0.585, bottom, 0.17, tall)), found)
-    if found.channels.histogram is not None:
-        _draw_values(figure.add_axes((0.81, bottom, 0.17, tall)), found.channels.histogram)
-
-
-def _draw_labels(axis: Axes, found: Survey) -> None:
-    labels = sorted(found.labels)
-    counts = [found.labels[label] for label in labels]
-    if len(labels) <= 12:
-        axis.bar(range(len(labels)), counts, color=COLORS[0])
-        axis.set_xticks(range(len(labels)), [f"{label:g}" for label in labels])
-    else:
-        axis.bar(labels, counts, color=COLORS[0], width=0.8 if len(labels) < 50 else 1.0)
-    axis.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    _finish(axis, "records per label")
-
-
-def _draw_values(axis: Axes, histogram: np.ndarray) -> None:
-    pairs = len(histogram) in (2, 6)
-    shown = histogram.reshape(2, -1, 256).sum(axis=0) if pairs else histogram
-    colors = CHANNEL_COLORS.get(len(shown), ("#555555",))
-    for channel, counts in enumerate(shown[: len(colors)]):
-        axis.plot(counts / max(counts.sum(), 1), color=colors[channel], linewidth=0.9)
-    axis.set_xlim(0, 255)
-    axis.set_xticks([0, 128, 255])
-    axis.set_yticks([])
-    _finish(axis, "values" if len(shown) == 1 else "values, by channel")
-
-
-def _finish(axis: Axes, title: str) -> None:
-    axis.set_title(title, fontsize=8.5)
-    axis.tick_params(labelsize=7.5, length=2)
-
-
-def _draw_record(
-    axis: Axes, record: Record, left: float, bottom: float, images: int, size: tuple[float, float]
-) -> None:
-    width, height = images * (size[0] + SEAM) - SEAM, size[1]
-    label = "no label" if record.label is None else f"label {record.label:g}"
-    if record.values is None:
-        axis.add_patch(Rectangle((left, bottom), width, height, facecolor="#fdecea", edgecolor=FAULT, linewidth=1.2))
-        text = textwrap.fill(record.fault, int(width * 12))
-        text_at(axis, left + 0.06, bottom + height - 0.08, text, fontsize=7.5, color=FAULT, va="top")
-    else:
-        for k, part in enumerate(split(record.values, images)):
-            draw_tile(axis, as_picture(part), left + k * (size[0] + SEAM), bottom, *size)
-    longest = int(width * 14)
-    key = record.key if len(record.key) <= longest else ".." + record.key[-longest + 2 :]
-    text_at(axis, left, bottom - 0.17, label, fontsize=8.5, fontweight="bold")
-    text_at(axis, left, bottom - 0.33, key, fontsize=7.5, color=PALE)

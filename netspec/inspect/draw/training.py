@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import matplotlib
 import numpy as np
@@ -17,7 +16,6 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from netspec.files.figures import COLORS, GRID
 from netspec.inspect.draw.style import FAULT, STYLE
 from netspec.inspect.logs.training_log import Curve, TrainingLog, shown_range, smoothed, thinned
-from netspec.log import logger
 
 WIDTH, LOSS_HEIGHT, HEIGHT = 9.0, 3.4, 2.3  # inches
 MOST_POINTS = 2000  # maximum number of points of a curve
@@ -28,25 +26,13 @@ MOST_MARKERS = 80  # maximum number of points in the width of the drawing
 _DASHED = (0, (4, 2))
 
 
-@dataclass(frozen=True)
-class Look:
-    """The options for curves: the smoothing window in points (None: a 25th of them), and a logarithmic axis.
-
-    Tests get markers if ``marker_distance`` iterations or more lie between them.
-    """
-
-    smooth: int | None = None
-    log: bool = False
-    marker_distance: float = 0.0
-
-
-def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Figure:
+def training_figure(logs: Sequence[TrainingLog]) -> Figure:
     """Draw trainings in different colors: a panel for losses, one for each other output, and one for the rate.
 
     The training loss is drawn light, and its smoothed curve dark. Tests are dashed, with markers. The parts have ids
-    in the SVG, such as ``run0-raw``.
+    in the SVG, such as ``run0-raw``. A test has a marker where the next is ``apart`` iterations or more away.
     """
-    look = replace(look or Look(), marker_distance=max((log.iteration for log in logs), default=0) / MOST_MARKERS)
+    apart = max((log.iteration for log in logs), default=0) / MOST_MARKERS
     others = other_outputs(logs)
     rates = any(len(log.rate) for log in logs)
     heights = [LOSS_HEIGHT] + [HEIGHT] * (len(others) + rates)
@@ -57,12 +43,12 @@ def training_figure(logs: Sequence[TrainingLog], look: Look | None = None) -> Fi
         )
         panels[0].set_title("loss")
         for number, log in enumerate(logs):
-            _draw_losses(panels[0], log, number, look)
-        _scale_losses(panels[0], logs, look)
+            _draw_losses(panels[0], log, number, apart)
+        _scale_losses(panels[0], logs)
         for axis, name in zip(panels[1:], others, strict=False):
             axis.set_title(name, parse_math=False)
             for number, log in enumerate(logs):
-                _draw_output(axis, log, name, number, look)
+                _draw_output(axis, log, name, number, apart)
         if rates:
             panels[-1].set_title("learning rate")
             for number, log in enumerate(logs):
@@ -92,11 +78,11 @@ def other_outputs(logs: Sequence[TrainingLog]) -> list[str]:
     return list(found)
 
 
-def _draw_losses(axis: Axes, log: TrainingLog, number: int, look: Look) -> None:
+def _draw_losses(axis: Axes, log: TrainingLog, number: int, apart: float) -> None:
     color = COLORS[number % len(COLORS)]
     x, y = log.loss.arrays()
     _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
-    _line(axis, x, smoothed(y, look.smooth), f"run{number}-smooth", color=color, linewidth=1.6)
+    _line(axis, x, smoothed(y), f"run{number}-smooth", color=color, linewidth=1.6)
     bad = x[~np.isfinite(y)]
     if len(bad):
         marks = axis.plot(bad, np.full(len(bad), 0.02), "x", color=FAULT, transform=axis.get_xaxis_transform())
@@ -104,23 +90,23 @@ def _draw_losses(axis: Axes, log: TrainingLog, number: int, look: Look) -> None:
     for net, curves in log.tests.items():
         for name, curve in curves.items():
             if name in log.losses:
-                _draw_test(axis, curve, number, net, look)
+                _draw_test(axis, curve, number, net, apart)
 
 
-def _draw_output(axis: Axes, log: TrainingLog, name: str, number: int, look: Look) -> None:
+def _draw_output(axis: Axes, log: TrainingLog, name: str, number: int, apart: float) -> None:
     if name not in log.losses and name in log.train:
         x, y = log.train[name].arrays()
         color = COLORS[number % len(COLORS)]
         _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
-        _line(axis, x, smoothed(y, look.smooth), f"run{number}-smooth", color=color, linewidth=1.6)
+        _line(axis, x, smoothed(y), f"run{number}-smooth", color=color, linewidth=1.6)
     for net, curves in log.tests.items():
         if name in curves and name not in log.losses:
-            _draw_test(axis, curves[name], number, net, look)
+            _draw_test(axis, curves[name], number, net, apart)
 
 
-def _draw_test(axis: Axes, curve: Curve, number: int, net: int, look: Look) -> None:
+def _draw_test(axis: Axes, curve: Curve, number: int, net: int, apart: float) -> None:
     x, y = curve.arrays()
-    marker = MARKERS[net % len(MARKERS)] if len(x) < 2 or np.median(np.diff(x)) >= look.marker_distance else ""
+    marker = MARKERS[net % len(MARKERS)] if len(x) < 2 or np.median(np.diff(x)) >= apart else ""
     color = COLORS[number % len(COLORS)]
     _line(axis, x, y, f"run{number}-test", color=color, linestyle=_DASHED, linewidth=1.1, marker=marker, markersize=4)
 
@@ -145,15 +131,10 @@ def _line(axis: Axes, x: np.ndarray, y: np.ndarray, name: str, **options: object
     line.set_gid(name)
 
 
-def _scale_losses(axis: Axes, logs: Sequence[TrainingLog], look: Look) -> None:
+def _scale_losses(axis: Axes, logs: Sequence[TrainingLog]) -> None:
     """Show the whole range, except for a few outliers."""
     tests = [curves[name] for log in logs for curves in log.tests.values() for name in log.losses & set(curves)]
     curves = [curve.arrays()[1] for curve in [*(log.loss for log in logs), *tests]]
-    if look.log and any((curve > 0).any() for curve in curves):
-        axis.set_yscale("log")
-        return
-    if look.log:
-        logger.warning("no loss is above 0: its axis is not logarithmic")
     found = shown_range(curves)
     if found is not None and found[1] > found[0]:
         margin = 0.05 * (found[1] - found[0])

@@ -55,14 +55,12 @@ class Curve:
         return np.array(self.iterations, float), np.array(self.values, float)
 
 
-def smoothed(values: np.ndarray, window: int | None = None) -> np.ndarray:
-    """Return the mean of the ``window`` values around each value (n,), with fewer values near the ends.
+def smoothed(values: np.ndarray) -> np.ndarray:
+    """Return the mean of a 25th of the values (n,) around each value, with fewer values near the ends.
 
-    NaN and infinity are ignored; if nothing is left, the mean is NaN. The default window is a 25th of the
-    values.
+    NaN and infinity are ignored; if nothing is left, the mean is NaN.
     """
-    size = max(1, len(values) // _POINTS_OF_WINDOW) if window is None else min(window, 2 * len(values))
-    half = size // 2
+    half = max(1, len(values) // _POINTS_OF_WINDOW) // 2
     known = np.isfinite(values)
     sums = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
     counts = np.concatenate([[0], np.cumsum(known)])

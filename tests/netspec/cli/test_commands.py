@@ -193,18 +193,6 @@ def test_upgrades_write_the_current_format(run: Run) -> None:
     )
 
 
-def test_flags_of_glog_and_of_caffes_other_commands_are_accepted(run: Run, tmp_path: Path) -> None:
-    flags = tmp_path / "flags"
-    flags.write_text("# all of them\n-iterations=1\n--stderrthreshold=2\n-colorlogtostderr\n")
-    words = ["time", "-model", NET, f"-flagfile={flags}", "-weights", "w", "-v=1", "-log_prefix=false"]
-    result = run(*words, "-log_dir", str(tmp_path))
-    assert result.status == 0
-    (logged,) = tmp_path.glob("caffe.*.log.INFO.*")
-    assert "] Use CPU." in logged.read_text()
-    wrong = run("time", "-model", NET, "-flagfile", "nowhere")
-    assert wrong.status == 2
-
-
 @pytest.mark.slow
 def test_a_user_without_a_name_or_a_home_is_served(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a container with ``--user 1234``. glog writes "invalid-user"."""

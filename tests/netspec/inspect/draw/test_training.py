@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import pytest
 
-from netspec.inspect.draw.training import Look, training_figure
+from netspec.inspect.draw.training import training_figure
 from netspec.inspect.logs.training_log import Curve, TrainingLog, read_log
 from paths import GOLDEN
 
@@ -40,7 +40,7 @@ def test_an_output_of_many_numbers_has_no_panel() -> None:
 
 
 def test_nan_losses_are_marked() -> None:
-    figure = training_figure([TrainingLog("x", Curve([0, 1, 2], [1, float("nan"), float("inf")]))], Look(log=True))
+    figure = training_figure([TrainingLog("x", Curve([0, 1, 2], [1, float("nan"), float("inf")]))])
     (marks,) = [line for line in figure.axes[0].lines if line.get_gid() == "run0-nan"]
     assert list(marks.get_xdata()) == [1, 2]  # pyright: ignore[reportArgumentType]
 
@@ -71,9 +71,3 @@ def test_logs_that_cannot_be_drawn_are_refused(run: Run_, words: tuple[object, .
     assert result.status == status
     assert said in result.err
     assert not Path("x.png").exists()
-
-
-def test_log_scale_without_a_positive_loss_gets_a_warning(run: Run_) -> None:
-    Path("x.log").write_text("Iteration 0, loss = -1\nIteration 10, loss = -2\n")
-    result = run("plot", "x.log", "--out", "x.svg", "--log_scale")
-    assert (result.status, result.err) == (0, "warning: no loss is above 0: its axis is not logarithmic\n")
