@@ -89,7 +89,7 @@ class Engine:
         keep = self.is_stored or self._build()[1]
         self._model = Model(self._choice, self._key if keep else "", self._export)
         with suppress(OSError):
-            self._passed.update((self._model.folder / SHAPES).read_text("utf-8").splitlines())
+            self._passed.update((self._model.folder / SHAPES).read_text("utf-8", "replace").splitlines())
         return self._model
 
     def _export(self, path: Path) -> None:

@@ -22,6 +22,7 @@ from netspec.files.whole_file import whole_folder
 from netspec.proto.forks import forks
 
 DIGESTS = "digests.json"  # of the files of an entry, by name
+EXPORTER = 2  # another number wherever exported models change between versions
 
 
 def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
@@ -30,7 +31,7 @@ def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:
     Raises SpecError for a file that cannot be read.
     """
     dialects = [[name, digest(file) if file else source] for name, file, source in forks().sources()]
-    parts = {"version": version(), "files": [*map(digest, files)], "dialects": dialects, "options": options}
+    parts = {"version": [version(), EXPORTER], "files": [*map(digest, files)], "dialects": dialects, "options": options}
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 

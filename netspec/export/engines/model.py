@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -68,9 +68,11 @@ class Model:
     def run(self, inputs: Arrays) -> dict[str, np.ndarray]:
         """Return the outputs, float32 by name, for inputs by name. The first pass in bf16 logs its difference.
 
-        Raises Unable if the library fails.
+        Raises Unable if the library fails, or if an input is empty: OpenVINO may end the process then.
         """
         with _unable():
+            if not all(value.size for value in inputs.values()):
+                raise Unable("an input is empty")
             found = self._run(inputs)
             if self._reduced:
                 self._reduced = False
@@ -122,7 +124,7 @@ def onnxruntime_runner(path: Path, precision: str) -> Runner:
     with _no_telemetry():
         import onnxruntime
     options: Any = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # errors
+    options.log_severity_level = 4  # fatal faults; all others are raised too
     options.intra_op_num_threads = threads()
     # Threads that wait in a loop would take the cores from those of a program's other nets.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -154,11 +156,15 @@ def openvino_runner(path: Path, precision: str) -> Runner:
     }
 
     @lru_cache(4)
-    def compiled(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[Any, set[str], list[str]]:
+    def compiled(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[Any, Container[str], list[str]]:
         model = core.read_model(str(path))
-        wanted = {given.any_name for given in model.inputs}
+        wanted = {given.any_name: given.partial_shape for given in model.inputs}
         outputs = [name for output in model.outputs for name in output.names]
-        model.reshape({name: list(shape) for name, shape in shapes if name in wanted})
+        made = {name: openvino.PartialShape(list(shape)) for name, shape in shapes if name in wanted}
+        for name, shape in made.items():
+            if not wanted[name].compatible(shape):  # reshape would change sizes that other parts of the model are for
+                raise Unable(f"input {name} has shape {shape} there, expected {wanted[name]}")
+        model.reshape(made)
         with _signal_stack_kept():
             return core.compile_model(model, "CPU", settings).create_infer_request(), wanted, outputs
 

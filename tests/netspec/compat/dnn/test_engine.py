@@ -70,7 +70,7 @@ def compare(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> No
     assert list(found) == list(expected)
     for name, values in expected.items():
         assert found[name].dtype == values.dtype
-        np.testing.assert_allclose(found[name], values, rtol=0, atol=1e-5 * max(1, abs(values).max()), strict=True)
+        np.testing.assert_allclose(found[name], values, rtol=0, atol=1e-5 * abs(values).max(initial=1), strict=True)
 
 
 @pytest.mark.parametrize("backend", ["DEFAULT", pytest.param("INFERENCE_ENGINE", marks=pytest.mark.slow)])
@@ -84,6 +84,16 @@ def test_outputs_equal_pytorchs(name: str, shapes: list[list[int]], backend: str
     runs.append(engine(net).run(net._caffe.values))
     compare(found, outputs(in_torch(read(name)), shapes))
     assert runs != [None]
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 25, 22), (0, 3, 20, 20)], ids=["another size", "empty"])
+@pytest.mark.parametrize("backend", ["DEFAULT", pytest.param("INFERENCE_ENGINE", marks=pytest.mark.slow)])
+def test_inputs_that_the_exported_net_is_not_for_run_in_pytorch(shape: tuple[int, ...], backend: str) -> None:
+    if backend == "INFERENCE_ENGINE":
+        pytest.importorskip("openvino")
+    net = read("classify")
+    net.setPreferableBackend(getattr(dnn, f"DNN_BACKEND_{backend}"))
+    compare(outputs(net, [list(shape)]), outputs(in_torch(read("classify")), [list(shape)]))
 
 
 @pytest.mark.slow
