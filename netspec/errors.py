@@ -59,13 +59,6 @@ class Code(Enum):
 
     UNKNOWN_TYPE = auto()  # details: the layer type
     UNKNOWN_BOTTOM = auto()  # details: the blob
-    CHANNELS = auto()  # of a bottom do not fit the filters
-    INPUTS = auto()  # of inner products; details: how many were found and expected
-    LABELS = auto()  # details: how many labels and predictions
-    SHAPES = auto()  # of bottoms differ
-    SHAPES_BESIDE_AXIS = auto()  # of bottoms that are joined differ in other axes
-    NO_KERNEL_SIZE = auto()
-    NOT_BINARY = auto()  # no message of protobuf in a file; details: the message that was expected
     UNWRITABLE = auto()  # details: the reason
 
 

@@ -293,8 +293,9 @@ def _add_fold(commands: Commands) -> None:
         "file", metavar="MODEL", help="the net's prototxt; the labels and losses of a training net are removed"
     )
     parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="PREFIX", help="write PREFIX.prototxt and PREFIX.caffemodel"
+    ends = (".prototxt", ".caffemodel")
+    parser.add_output(
+        "--out", ends=ends, type=Path, required=True, metavar="PREFIX", help=f"write PREFIX{' and PREFIX'.join(ends)}"
     )
     add_part(parser)
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import torch
 
-from netspec.errors import Code
 from netspec.exact import SMALL_PRODUCT
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
@@ -45,7 +44,7 @@ class InnerProduct(Layer):
         found = math.prod(shape[self.axis :])
         if found != self.inputs:
             message = f"bottom of shape {shape} has {found} values from axis {self.axis} on, expected {self.inputs}"
-            raise self.error(message, "bottom", code=Code.INPUTS, details=(found, self.inputs))
+            raise self.error(message, "bottom")
         return [(*shape[: self.axis], self.param.inner_product_param.num_output)]
 
     def forward(self, data: torch.Tensor) -> torch.Tensor:

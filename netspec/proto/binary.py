@@ -10,7 +10,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
-from netspec.errors import Code, SpecError, Where
+from netspec.errors import SpecError, Where
 from netspec.files.kinds import kind_of, pointer_fault, unreadable
 from netspec.files.limits import read_bytes
 from netspec.proto.schema import NetParameter
@@ -51,7 +51,7 @@ def parse_binary(data: bytes, file: str, message_class: type[M]) -> M:
         known = False
     if not known:
         message = f"expected a binary {name}, found {_guess(data, message_class)}"
-        raise SpecError(message, where, Code.NOT_BINARY, (name,))
+        raise SpecError(message, where)
     _escape_names(message)
     return message
 

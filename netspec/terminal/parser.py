@@ -47,13 +47,17 @@ class Parser(argparse.ArgumentParser):
         self.register("action", "store_true", _Switch)
         self._has_commands = False
 
-    def add_output(self, *names: str, folder: bool = False, **options: Any) -> None:
+    def add_output(self, *names: str, folder: bool = False, ends: Sequence[str] = ("",), **options: Any) -> None:
         """Add an argument that names a file to write, or a ``folder`` to write into, which is made where it is missing.
 
-        Whether it can be written is checked before the command begins.
+        Whether it can be written is checked before the command begins; with ``ends``, the files with these endings.
         """
         action = self.add_argument(*names, **options)
-        check = why_no_folder if folder else why_unwritable
+
+        def check(path: Any) -> str:
+            reasons = [why_no_folder(path)] if folder else [why_unwritable(f"{path}{end}") for end in ends]
+            return next(filter(None, reasons), "")
+
         self.set_defaults(outputs={**(self.get_default("outputs") or {}), action.dest: check})
 
     def add_subparsers(self, **options: Any) -> Any:

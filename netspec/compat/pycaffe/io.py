@@ -13,6 +13,7 @@ import numpy as np
 
 from netspec.compat.pycaffe import errors
 from netspec.compat.pycaffe.proto import caffe_pb2
+from netspec.data.preprocess import preprocessed
 
 Array = np.ndarray
 Extents = Sequence[int] | Array
@@ -112,15 +113,8 @@ class Transformer:
             values = resize_image(values, size)
         if in_ in self.transpose:
             values = values.transpose(self.transpose[in_])
-        if in_ in self.channel_swap:
-            values = values[list(self.channel_swap[in_]), :, :]
-        if in_ in self.raw_scale:
-            values *= self.raw_scale[in_]
-        if in_ in self.mean:
-            values -= self.mean[in_]
-        if in_ in self.input_scale:
-            values *= self.input_scale[in_]
-        return values
+        order, mean = self.channel_swap.get(in_), self.mean.get(in_)
+        return preprocessed(values, order, self.raw_scale.get(in_, 1.0), mean, self.input_scale.get(in_, 1.0))
 
     def deprocess(self, in_: str, data: Array) -> Array:
         """Undo ``preprocess`` for an input (K, H, W), except for its size."""

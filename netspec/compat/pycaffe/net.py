@@ -16,7 +16,7 @@ import numpy as np
 from netspec import log
 from netspec.compat.alias import AliasFinder
 from netspec.compat.pycaffe import mode
-from netspec.compat.pycaffe.errors import caffes_errors
+from netspec.compat.pycaffe.errors import unwrapped_errors
 from netspec.compat.pycaffe.named import Named
 from netspec.compat.pycaffe.proto import caffe_pb2
 from netspec.compat.pycaffe.runner import BlobRunner
@@ -84,7 +84,7 @@ class Net:
             raise TypeError(message)
         network_file = file_of(network_file)
         weights = None if weights is None else file_of(weights)
-        with caffes_errors():
+        with unwrapped_errors():
             net, source = parse_net(network_file)
             net = with_state(net, PhaseValue(phase), level or 0, stages or ())
             self._set_net(build_net(net, source, mode.build_options()))
@@ -220,7 +220,7 @@ class Net:
         self._backward(len(self.layers) - 1, 0)
 
     def _forward(self, start: int, end: int) -> float:
-        with self.runner.used(), caffes_errors():
+        with self.runner.used(), unwrapped_errors():
             return self.runner.forward(start, end).item()
 
     def _backward(self, start: int, end: int) -> None:
@@ -295,7 +295,7 @@ class Net:
 
     def reshape(self) -> None:
         """Give every blob the shape that follows from those of the inputs."""
-        with caffes_errors():
+        with unwrapped_errors():
             self.runner.reshape()
 
     def clear_param_diffs(self) -> None:
@@ -322,7 +322,7 @@ class Net:
         """Copy the weights of a .caffemodel, binary or HDF5, into the layers of the same names."""
         weights = file_of(weights)
         self.runner.upload()
-        with caffes_errors():
+        with unwrapped_errors():
             load_weights(self.runner.net, weights)
 
     def load_hdf5(self, weights: FilePath) -> None:

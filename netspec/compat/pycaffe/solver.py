@@ -16,7 +16,7 @@ from typing_extensions import override
 from netspec import log
 from netspec.compat.pycaffe import mode
 from netspec.compat.pycaffe.debug import debug_info
-from netspec.compat.pycaffe.errors import caffes_errors
+from netspec.compat.pycaffe.errors import unwrapped_errors
 from netspec.compat.pycaffe.net import FilePath, Net
 from netspec.graph.options import BuildOptions
 from netspec.graph.speed import speed
@@ -92,7 +92,7 @@ class Solver:
         self._build(param, node)
 
     def _build(self, param: Any, node: Position) -> None:
-        with caffes_errors():
+        with unwrapped_errors():
             build = BuildOptions(seed=mode.next_seed(), allow_python=True, exact=mode.exact(), speed=speed())
             # nan: the training continues, as in Caffe; a script may check the loss itself
             options = TrainingOptions(build, [mode.device()], nan="warn")
@@ -130,13 +130,13 @@ class Solver:
             log.info("solver.cpp:296", f"Restoring previous solver status from {os.fsdecode(resume_file)}")
             self.restore(resume_file)
         self.net.runner.upload()
-        with caffes_errors():
+        with unwrapped_errors():
             self._training.solve()
 
     def step(self, iterations: int) -> None:
         """Run a number of iterations."""
         self.net.runner.upload()
-        with caffes_errors():
+        with unwrapped_errors():
             self._training.step(int(iterations))
 
     def restore(self, state_file: FilePath) -> None:

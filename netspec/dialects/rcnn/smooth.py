@@ -11,7 +11,6 @@ from typing_extensions import override
 
 from netspec.dialects.gradients import with_gradient_of
 from netspec.dialects.registry import added_value
-from netspec.errors import Code
 from netspec.layers import Layer
 from netspec.layers.contract.base import Shape
 from netspec.layers.loss.base import VALID, Loss, normalization_mode, normalizer
@@ -79,7 +78,7 @@ class SmoothL1Loss(Loss):
         for i, shape in enumerate(full):
             if shape != full[0]:
                 message = f"found bottoms of shapes {bottom_shapes[0]} and {bottom_shapes[i]}, expected equal shapes"
-                raise self.error(message, "bottom", i, code=Code.SHAPES)
+                raise self.error(message, "bottom", i)
         return [(), (full[0][0], 1, *full[0][2:])][: self.num_tops]
 
     def forward(

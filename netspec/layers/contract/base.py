@@ -21,7 +21,7 @@ import torch
 from typing_extensions import override
 
 from netspec.data.blobs import Shape
-from netspec.errors import Code, SpecError
+from netspec.errors import SpecError
 from netspec.exact import NONE
 from netspec.exact.arithmetic import AsTorch, arithmetic
 from netspec.files.limits import amount, is_out_of_memory, memory
@@ -372,11 +372,9 @@ class Layer(torch.nn.Module):
         if found:
             raise found[-1]
 
-    def error(
-        self, message: str, *path: str | int, code: Code | None = None, details: tuple[object, ...] = ()
-    ) -> SpecError:
+    def error(self, message: str, *path: str | int) -> SpecError:
         """Return a SpecError at a field of this layer, e.g. ``self.error("...", "pooling_param", "kernel_size")``."""
-        return SpecError(message, self.context.at(*path), code, details)
+        return SpecError(message, self.context.at(*path))
 
     def canonical_axis(self, axis: int, shape: Shape, *path: str | int) -> int:
         """Return ``axis`` counted from the front; negative ones count from the end (Caffe: CanonicalAxisIndex)."""

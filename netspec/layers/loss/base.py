@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from netspec.errors import Code
 from netspec.layers.contract.base import Layer, Shape
 
 FULL, VALID, BATCH_SIZE, NONE = 0, 1, 2, 3  # caffe.proto: enum LossParameter.NormalizationMode
@@ -48,8 +47,6 @@ class Classified(Layer):
                 f"{scores}; expected one label (0 to {self.classes - 1}) per prediction along axis {axis}",
                 "bottom",
                 1,
-                code=Code.LABELS,
-                details=(math.prod(labels), self.outer * self.inner),
             )
 
     def scores_and_labels(self, scores: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import torch
 
-from netspec.errors import Code
 from netspec.exact.sums import product_gradient
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
@@ -45,7 +44,7 @@ class Eltwise(Layer):
         for i, shape in enumerate(bottom_shapes):
             if shape != bottom_shapes[0]:
                 message = f"found bottoms of shapes {bottom_shapes[0]} and {shape}, expected equal shapes"
-                raise self.error(message, "bottom", i, code=Code.SHAPES)
+                raise self.error(message, "bottom", i)
         return bottom_shapes[:1]
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:

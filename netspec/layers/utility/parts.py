@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from netspec.errors import Code
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 
@@ -46,7 +45,7 @@ class Concat(Layer):
             others = zip(first[:axis] + first[axis + 1 :], shape[:axis] + shape[axis + 1 :], strict=False)
             if len(shape) != len(first) or any(a != b for a, b in others):
                 message = f"found bottoms of shapes {first} and {shape}, expected equal shapes except along axis {axis}"
-                raise self.error(message, "bottom", i, code=Code.SHAPES_BESIDE_AXIS)
+                raise self.error(message, "bottom", i)
         return [(*first[:axis], sum(shape[axis] for shape in bottom_shapes), *first[axis + 1 :])]
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 
-from netspec.errors import Code
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.vision.windows import (
@@ -85,7 +84,7 @@ class Pooling(_PoolingBase):
             raise self.error(f"found {given[0]} only; give both {name_h} and {name_w}, or {name}", field, given[0])
         if not given and name == "kernel_size" and not param.HasField(name):
             message = "kernel_size (or kernel_h and kernel_w, or global_pooling) is missing"
-            raise self.error(message, field, code=Code.NO_KERNEL_SIZE)
+            raise self.error(message, field)
         pair = (getattr(param, name_h), getattr(param, name_w)) if given else (getattr(param, name),) * 2
         if min(pair) < least:
             raise self.error(

@@ -9,7 +9,6 @@ from itertools import chain
 import torch
 from torch.nn import functional as F
 
-from netspec.errors import Code
 from netspec.exact.products import Filter
 from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.contract.registry import register
@@ -34,9 +33,7 @@ class SlidingFilter(Layer):
         self.spatial_axes = len(shape) - self.channel_axis - 1
         given = param.kernel_size or param.HasField("kernel_h") or param.HasField("kernel_w")
         if self.spatial_axes and not given:
-            raise self.error(
-                "kernel_size (or kernel_h and kernel_w) is missing", "convolution_param", code=Code.NO_KERNEL_SIZE
-            )
+            raise self.error("kernel_size (or kernel_h and kernel_w) is missing", "convolution_param")
         self.kernel = self._read("kernel_size", "kernel_h", "kernel_w", default=1, least=1)
         self.stride = self._read("stride", "stride_h", "stride_w", default=1, least=1)
         self.pad = self._read("pad", "pad_h", "pad_w", default=0, least=0)
@@ -92,7 +89,6 @@ class SlidingFilter(Layer):
                 f"bottom of shape {shape} does not fit the filters, made for {channels} channels at axis "
                 f"{self.channel_axis} and {self.spatial_axes} spatial axes",
                 "bottom",
-                code=Code.CHANNELS,
             )
         for i, other in enumerate(bottom_shapes):
             if other != shape:

@@ -13,7 +13,6 @@ import torch
 
 import netspec
 import netspec.pycaffe as caffe
-from case_files import read_cases
 from paths import ROOT
 from pycaffe_nets import INPUT, PYRAMID, image
 
@@ -341,22 +340,6 @@ def test_errors_do_not_damage_the_net(
     assert net.forward()["prob1"].sum() == pytest.approx(25, rel=1e-4)
 
 
-X = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 8 } } }\n'
-FOUR = 'layer { name: "ip" type: "InnerProduct" bottom: "x" top: "ip" inner_product_param { num_output: 4 } }\n'
-
-
-CHECKS = read_cases("netspec/compat/pycaffe/cases/checks.txt")
-
-
-@pytest.mark.parametrize("case", CHECKS.values(), ids=CHECKS)
-def test_a_failed_check_has_caffes_message_and_the_location(
-    net_of: Callable[..., caffe.Net], case: dict[str, str]
-) -> None:
-    with pytest.raises(ValueError, match=rf"net\.prototxt:{case['place']}: ") as fault:
-        net_of(X + case["layers"])
-    assert case["check"] in str(fault.value)
-
-
 def test_an_interrupted_pass_leaves_its_records_to_the_next(net_of: Callable[..., caffe.Net]) -> None:
     net = net_of(
         """layer { name: "m" type: "MemoryData" top: "d" top: "l"
@@ -378,18 +361,6 @@ def test_an_interrupted_pass_leaves_its_records_to_the_next(net_of: Callable[...
             net.forward()
     interrupt.clear()
     assert net.forward()["l"] == 1
-
-
-def test_a_failed_check_of_a_pass_has_caffes_message(net_of: Callable[..., caffe.Net], tmp_path: Path) -> None:
-    net = net_of(X + FOUR)
-    net.blobs["x"].reshape(2, 3, 9, 9)
-    for run in (net.forward, net.reshape):
-        with pytest.raises(ValueError, match="InnerProduct") as fault:
-            run()
-        assert "(Check failed: K_ == new_K (192 vs. 243) Input size incompatible with inner" in str(fault.value)
-    (tmp_path / "bad.caffemodel").write_text("words")
-    with pytest.raises(ValueError, match=r"bad\.caffemodel: .*Failed to parse NetParameter file: .*bad\.caffemodel"):
-        net.copy_from(tmp_path / "bad.caffemodel")
 
 
 @pytest.mark.slow
