@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from typing_extensions import override
 
 from netspec.data.database import Reader
 from netspec.data.datum import parse_datum, shape_text
@@ -125,45 +126,51 @@ class Together(Protocol):
 
 
 @dataclass(frozen=True)
-class _Item:
+class Item:
+    """A record of an ImageSource; ``where`` is its position in a list, or that of the database in the prototxt."""
+
     name: str
     image: np.ndarray
     label: int
     where: Where | None
 
 
-class _ImageSource:
+class ImageSource:
     """Images with labels, read one at a time and made into batches by a Transformer.
 
     With a batch size of 1, images can have different sizes. Otherwise all transformed images must have the shape of the
     first; raises SpecError with the name of the record if one does not.
     """
 
+    label_axes: Shape = ()  # further axes of the labels
+
     def __init__(self, cursor: Cursor, transformer: Transformer) -> None:
         self.cursor = cursor
         self._transform = transformer
-        first = self._item(cursor.first())
+        first = self.item(cursor.first(), cursor.positions(0)[0])
         self._first_name = first.name
         self._shape = transformer.output_shape(first.image.shape)
 
-    def _item(self, record: int) -> _Item:
+    def item(self, record: int, position: int) -> Item:
+        """Read a record for this position in the endless sequence of records."""
         raise NotImplementedError
 
     @property
     def shapes(self) -> Sequence[Shape]:
         """The shapes of images and labels."""
-        return (self.cursor.batch_size, *self._shape), (self.cursor.batch_size,)
+        return (self.cursor.batch_size, *self._shape), (self.cursor.batch_size, *self.label_axes)
 
     def batch(self, iteration: int) -> Arrays:
         """Return images (N, C, H, W) and labels (N,)."""
-        items = [self._item(record) for record in self.cursor.records(iteration)]
+        positions = self.cursor.positions(iteration)
+        items = [self.item(*each) for each in zip(self.cursor.records(iteration), positions, strict=True)]
         if len(items) > 1:
             for item in items:
                 self._check_shape(item)
-        data = self._transform([item.image for item in items], self.cursor.positions(iteration))
-        return data, np.array([item.label for item in items], np.float32)
+        labels = np.array([item.label for item in items], np.float32).reshape(-1, *self.label_axes)
+        return self._transform([item.image for item in items], positions), labels
 
-    def _check_shape(self, item: _Item) -> None:
+    def _check_shape(self, item: Item) -> None:
         shape = self._transform.output_shape(item.image.shape)
         if shape != self._shape:
             first = f'the first record, "{self._first_name}", gives {shape_text(self._shape)}'
@@ -171,7 +178,7 @@ class _ImageSource:
             raise SpecError(f'record "{item.name}" gives {shape_text(shape)}, but {first}; {advice}', item.where)
 
 
-class DatabaseSource(_ImageSource):
+class DatabaseSource(ImageSource):
     """The Datums of a database, as in Caffe's Data layer. Records are named by their keys.
 
     ``at_once`` reads many records faster than one by one: it returns their images (N, C, H, W), uint8 or float32, and
@@ -217,17 +224,18 @@ class DatabaseSource(_ImageSource):
     def _name(self, record: int) -> str:
         return self._reader.key(record).decode(errors="backslashreplace")
 
-    def _item(self, record: int) -> _Item:
+    @override
+    def item(self, record: int, position: int) -> Item:
         try:
             datum = parse_datum(self._reader.record(record))
-            return _Item(self._name(record), self._transform.decode(datum), datum.label, self._where)
+            return Item(self._name(record), self._transform.decode(datum), datum.label, self._where)
         except SpecError as fault:  # an error of the database itself
             raise SpecError(fault.message, fault.where or self._where) from None
         except ValueError as fault:
             raise SpecError(f'record "{self._name(record)}" {fault}', self._where) from None
 
 
-class ImageListSource(_ImageSource):
+class ImageListSource(ImageSource):
     """Image files of a list, as in Caffe's ImageData layer. Records are named as in the list.
 
     Images are resized to ``size`` (height, width), unless it is None; ``root`` is prepended to each name.
@@ -249,10 +257,11 @@ class ImageListSource(_ImageSource):
         """Return the names of the images of an iteration."""
         return [self._images[record].name for record in self.cursor.records(iteration)]
 
-    def _item(self, record: int) -> _Item:
+    @override
+    def item(self, record: int, position: int) -> Item:
         listed = self._images[record]
         try:
             image = read_image(self._root + listed.name, self._color, self._size)
         except ValueError as fault:
             raise SpecError(str(fault), listed.where) from None
-        return _Item(listed.name, image, listed.label, listed.where)
+        return Item(listed.name, image, listed.label, listed.where)

@@ -17,7 +17,7 @@ from typing_extensions import override
 from netspec.data.images import list_lines, read_image, read_label
 from netspec.data.random_words import words
 from netspec.data.resize import resized
-from netspec.data.sources import Arrays, Cursor, Source
+from netspec.data.sources import Cursor, ImageSource, Item, Source
 from netspec.data.transformer import Transformer, contradictions
 from netspec.dialects.layers import replace
 from netspec.errors import SpecError, Where
@@ -201,39 +201,29 @@ def read_videos(path: str, where: Where | None = None) -> list[Video]:
     return videos
 
 
-class VideoSource:
+class VideoSource(ImageSource):
     """Batches of videos: consecutive frames from each of ``num_segments`` equal parts, as channels.
 
     The frames of a part begin at a random position in training, and at its center in testing. Raises SpecError for a
     frame that cannot be read, and for a video whose frames have another size than the first video's.
     """
 
+    label_axes = (1, 1, 1)
+
     def __init__(
         self, param: Any, videos: Sequence[Video], cursor: Cursor, transform: Transformer, draws: Any, phase: int
     ) -> None:
-        self.cursor, self._param, self._videos, self._transform = cursor, param, videos, transform
-        self._draws, self._training = draws, phase == TRAIN
+        self._param, self._videos, self._draws, self._training = param, videos, draws, phase == TRAIN
         default = "image_%04d.jpg" if param.modality == RGB else "flow_%c_%04d.jpg"
         self._pattern = param.name_pattern or default
-        self._shape = transform.output_shape(self._read(cursor.first(), 0).shape)
-        self.shapes: Sequence[Shape] = [(cursor.batch_size, *self._shape), (cursor.batch_size, 1, 1, 1)]
+        super().__init__(cursor, transform)
 
     def keys(self, iteration: int) -> list[str]:
         """Return the folders of an iteration."""
         return [self._videos[record].folder for record in self.cursor.records(iteration)]
 
-    def batch(self, iteration: int) -> Arrays:
-        """Return frames (N, C, H, W) and labels (N, 1, 1, 1)."""
-        records, positions = self.cursor.records(iteration), self.cursor.positions(iteration)
-        frames = [self._read(record, position) for record, position in zip(records, positions, strict=True)]
-        for record, found in zip(records, frames, strict=True):
-            if self._transform.output_shape(found.shape) != self._shape and len(frames) > 1:
-                raise SpecError(f"found frames of {found.shape[1:]}, others than the first", self._videos[record].where)
-        labels = np.array([self._videos[record].label for record in records], np.float32)
-        return self._transform(frames, positions), labels.reshape(-1, 1, 1, 1)
-
-    def _read(self, record: int, position: int) -> Array:
-        """Return the concatenated frames of a video: (C, H, W)."""
+    @override
+    def item(self, record: int, position: int) -> Item:
         video, p = self._videos[record], self._param
         length = video.frames // p.num_segments
         starts, planes = length - p.new_length + 1, []  # how many frames of a segment can be the first
@@ -244,8 +234,7 @@ class VideoSource:
             if starts > 0:
                 start = segment * length + (draw % starts if self._training else starts // 2)
             for number in range(start + 1, start + p.new_length + 1):
-                names = [(number,)] if p.modality == RGB else [("x", number), ("y", number)]
-                for name in names:
+                for name in [(number,)] if p.modality == RGB else [("x", number), ("y", number)]:
                     path = f"{video.folder}/{self._pattern % name}"
                     try:
                         planes.append(read_image(path, p.modality == RGB and not p.grayscale, size))
@@ -253,7 +242,7 @@ class VideoSource:
                         raise SpecError(str(fault), video.where) from None
         if len({plane.shape[1:] for plane in planes}) > 1:
             raise SpecError("its frames differ in size", video.where)
-        return np.concatenate(planes)
+        return Item(video.folder, np.concatenate(planes), video.label, video.where)
 
 
 @register("VideoData", GROUP, *TRANSFORM, "data_param.prefetch")
