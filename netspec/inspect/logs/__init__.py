@@ -1,1 +1,1 @@
-"""Reads the logs of trainings by netspec and Caffe: loss, outputs, rate and speed."""
+"""Reads the logs of trainings by netspec and Caffe: loss, outputs and rate."""

@@ -9,7 +9,6 @@ import math
 import re
 from bisect import bisect_left
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +102,7 @@ RUNNING, DONE, STOPPED, FAILED = "running", "done", "stopped early", "failed"
 
 # `I1121 00:36:27.939015 12135 solver.cpp:239] ...`; newer versions of glog also write the year.
 _COUNT = "([0-9]{1,10})(?![0-9])"  # an int of 32 bits
-_PREFIX = re.compile(rf"([IWEF])(?:\d{{4}})?(\d\d)(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{{6}}) +{_COUNT} (\S+?)\] ?(.*)")
+_PREFIX = re.compile(rf"([IWEF])(?:\d{{4}})?\d{{4}} \d\d:\d\d:\d\d\.\d{{6}} +{_COUNT} \S+?\] ?(.*)")
 _LOSS = re.compile(rf"Iteration {_COUNT}[^=]*, loss = (\S+)")
 _RATE = re.compile(rf"Iteration {_COUNT}, lr = (\S+)")
 _TESTING = re.compile(rf"Iteration {_COUNT}, Testing net(?: \(#{_COUNT}\))?")
@@ -116,7 +115,6 @@ _FAULT = re.compile(r"Traceback |\*\*\* .*SIG|\S[^:]*:\d+:\d+: ")
 # training does not go on: a net is printed without prefixes too, and so is what a Python layer prints.
 _LAST_LINE = re.compile(rf"\S[^:]*: |\[Errno |{OUT_OF_MEMORY}")
 _WINDOWS = {"1.#QNAN": "nan", "-1.#IND": "nan", "1.#INF": "inf", "-1.#INF": "-inf"}
-_YEAR = 366 * 86400.0
 _GREATEST = float(np.finfo(np.float32).max)
 
 
@@ -126,8 +124,7 @@ class TrainingLog:
 
     ``loss`` is averaged over ``average_loss`` iterations. ``train`` and ``tests`` are the outputs of the training net
     and, by index, of the test nets: name -> curve. For a blob with several values, the second is
-    ``name[1]``. ``losses`` are the names of outputs that have a loss weight. ``times`` are seconds since the first
-    line, at the iterations of ``loss``.
+    ``name[1]``. ``losses`` are the names of outputs that have a loss weight.
     """
 
     name: str
@@ -136,7 +133,6 @@ class TrainingLog:
     train: dict[str, Curve] = field(default_factory=dict)
     tests: dict[int, dict[str, Curve]] = field(default_factory=dict)
     losses: set[str] = field(default_factory=set)
-    times: Curve = field(default_factory=Curve)
     state: str = RUNNING
 
     @property
@@ -152,7 +148,7 @@ class TrainingLog:
     def curves(self) -> list[Curve]:
         """Return all curves."""
         tests = [curve for net in self.tests.values() for curve in net.values()]
-        return [self.loss, self.rate, self.times, *self.train.values(), *tests]
+        return [self.loss, self.rate, *self.train.values(), *tests]
 
 
 class LogReader:
@@ -162,8 +158,6 @@ class LogReader:
         self.log = TrainingLog(name)
         self._position = 0  # the iteration of the last line
         self._net = 0  # the test net being tested
-        self._first: float | None = None
-        self._last = 0.0
         self._has_prefixes = self._is_fatal = False
         self.begins = False  # whether the start of a training was read
         self._names: dict[tuple[str, int, int], tuple[str, str]] = {}
@@ -176,12 +170,12 @@ class LogReader:
             self._read_without_prefix(line)
             return
         self._has_prefixes = True
-        message = prefix[10]
+        message = prefix[3]
         if message.startswith("Initializing solver from parameters"):
             self.log.state, self._is_fatal, self.begins = RUNNING, False, True
         elif prefix[1] == "I" and self.log.state == FAILED and not self._is_fatal:
             self.log.state = RUNNING
-        self._read(message, self._seconds(prefix))
+        self._read(message)
         if prefix[1] == "F":
             self.log.state, self._is_fatal = FAILED, True
 
@@ -192,15 +186,12 @@ class LogReader:
         elif _FAULT.match(line) or (self._has_prefixes and self.log.state == RUNNING and _LAST_LINE.match(line)):
             self.log.state = FAILED
         else:
-            self._read(line, None)
+            self._read(line)
 
-    def _read(self, message: str, seconds: float | None) -> None:
+    def _read(self, message: str) -> None:
         log = self.log
         if found := _LOSS.search(message):
-            iteration = self._at(found[1])
-            log.loss.add(iteration, _number(found[2]))
-            if seconds is not None:
-                log.times.add(iteration, seconds)
+            log.loss.add(self._at(found[1]), _number(found[2]))
         elif found := _OUTPUT.search(message):
             self._output(found[1], int(found[2]), found[3], found[4], "loss)" in message)
         elif found := _RATE.search(message):
@@ -238,21 +229,6 @@ class LogReader:
         if is_loss:
             self.log.losses.add(name)
 
-    def _seconds(self, prefix: re.Match[str]) -> float:
-        """Return the seconds since the first line; old logs have no year."""
-        month, day, hour, minute, second, micros = (int(prefix[k]) for k in range(2, 8))
-        try:
-            now = datetime(2000, month, day, hour, minute, second, micros).timestamp()
-        except ValueError:
-            return self._last
-        if self._first is None:
-            self._first = now
-        seconds = now - self._first
-        while seconds < self._last - _YEAR / 2:
-            seconds += _YEAR
-        self._last = seconds
-        return seconds
-
 
 def read_log(path: str | Path, name: str = "") -> TrainingLog:
     """Return the training in a log; one that failed before its first iteration has no curves.
@@ -286,7 +262,7 @@ _MOST_OUTPUTS = 6  # of each test net in a summary
 
 
 def summary(log: TrainingLog) -> dict[str, str]:
-    """Return by name: state, iterations, the last losses and test outputs, the minimum test loss, iter/s."""
+    """Return by name: state, iterations, the last losses and test outputs, the minimum test loss."""
     found = {"state": "unfinished" if log.state == RUNNING else log.state, "iterations": f"{log.iteration:,}"}
     if log.loss.last is not None:
         found["last loss"] = number(log.loss.last)
@@ -298,14 +274,4 @@ def summary(log: TrainingLog) -> dict[str, str]:
             if name in log.losses and finite:
                 least = min(finite)
                 found[f"least {label} {name}"] = f"{number(least)} at {curve.iterations[curve.values.index(least)]:,}"
-    if speed := iterations_per_second(log):
-        found["iter/s"] = number(float(f"{speed:.3g}"))
     return found
-
-
-def iterations_per_second(log: TrainingLog) -> float | None:
-    """Return the speed from the times in the log, including tests."""
-    iterations, seconds = log.times.iterations, log.times.values
-    if len(iterations) < 2 or seconds[-1] <= seconds[0]:
-        return None
-    return (iterations[-1] - iterations[0]) / (seconds[-1] - seconds[0])

@@ -10,7 +10,6 @@ from netspec.inspect.logs.training_log import (
     Curve,
     LogReader,
     TrainingLog,
-    iterations_per_second,
     read_log,
     shown_range,
     summary,
@@ -38,7 +37,6 @@ def test_read_log_reads_a_log_of_caffe() -> None:
     assert run.train["loss"].values == run.loss.values[:-1]
     assert run.losses == {"loss"}
     assert (run.state, run.iteration) == ("done", 60)
-    assert run.times.values[-1] == pytest.approx(0.639364, abs=1e-6)
     assert summary(run)["least test loss"] == "0.0502543 at 50"
 
 
@@ -80,7 +78,6 @@ def test_logs_without_glog_prefixes_and_of_several_nodes_are_read() -> None:
     assert reader.log.loss == Curve([10, 20], [0.5, 0.75])
     assert reader.log.train == {"loss: a = b": Curve([10], [0.25])}
     assert reader.log.tests == {0: {"top-1": Curve([20], [0.5])}}
-    assert not len(reader.log.times)
 
 
 @pytest.mark.parametrize("text", ["nan", "-nan", "1.#QNAN", "-1.#IND"])
@@ -102,15 +99,6 @@ def test_a_resumed_training_replaces_repeated_lines() -> None:
                test[1], "Iteration 10, loss = 4")  # fmt: skip
     assert run.loss == Curve([0, 10], [1, 4])
     assert run.tests[0]["loss"] == Curve([10], [2])
-
-
-def test_times_continue_across_new_year() -> None:
-    reader = LogReader("log")
-    reader.feed("I1231 23:59:59.000000 1 solver.cpp:239] Iteration 0, loss = 1")
-    reader.feed("I0101 00:00:01.000000 1 solver.cpp:239] Iteration 10, loss = 1")
-    assert reader.log.times.values[1] == pytest.approx(2, abs=86400.0)
-    assert reader.log.times.values[1] > 0
-    assert iterations_per_second(reader.log)
 
 
 @pytest.mark.parametrize(
