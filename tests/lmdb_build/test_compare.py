@@ -12,12 +12,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 import forked
-from lmdb_build.cli import main, parser
+from lmdb_build.cli import main
 from lmdb_build.compare import best_snapshot, read_entry
 from netspec.cli.scores import read_scores
 from netspec.errors import SpecError
@@ -141,55 +140,12 @@ def test_a_training_resumes(edited: Callable[..., None]) -> None:
     assert {**row("out"), "ms/image": ""} == {**before, "ms/image": ""}
 
 
-def test_trainings_in_another_precision(edited: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
-    started = []
-
-    class Listed(Forked):
-        def __init__(self, command: list[str], **_: object) -> None:
-            started.append(" ".join(command[3:]))
-            super().__init__(command)
-
-    monkeypatch.setattr("lmdb_build.compare.subprocess", SimpleNamespace(Popen=Listed, PIPE=subprocess.PIPE))
-    assert main(["compare", SOLVER, "--out", "out", "--precision", "tf32"]) == 0
-    training, *others = started
-    assert training.startswith("train")
-    assert "--precision tf32" in training
-    assert others
-    assert not any("--precision" in command for command in others)
-
-
-def test_each_training_has_its_own_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now = 1000.0
-
-    def trainings(solvers: object, out: object, choices: object, say: object, step: Callable[..., None]) -> Any:
-        nonlocal now
-        for first, seconds in ((0, 100.0), (0, 10.0), (50, 20.0)):  # the last one is resumed
-            for done in range(first, 201, 50):
-                step(done, 200, "0.1")
-                now += seconds
-        return "", []
-
-    monkeypatch.setattr("lmdb_build.compare.compare", trainings)
-    monkeypatch.setattr("time.monotonic", lambda: now)
-    assert main(["compare", SOLVER]) == 0
-    left = re.findall(r"about (\S+) left", capsys.readouterr().err)
-    assert left == ["0:05:00", "0:03:20", "0:01:40", "0:00:30", "0:00:20", "0:00:10", "0:00:40", "0:00:20"]
-
-
 def test_without_training_existing_snapshots_are_scored(folder: Path) -> None:
     for iteration, name in ((40, "ref_iter_40"), (60, "straight_iter_60")):
         model = (GOLDEN / "snapshot" / f"{name}.caffemodel").read_bytes()
         (folder / "sgd_step" / f"ref_iter_{iteration}.caffemodel").write_bytes(model)
     assert main(["compare", SOLVER, "--no-train"]) == 0
     assert row("out/compare")["iteration"] in ("40", "60")
-
-
-def test_no_train_accepts_gflags_spellings() -> None:
-    words = (["--no-train"], ["-notrain"], ["--train=false"], [], ["-train"])
-    found = [parser().parse_args(["compare", "s", *more]).train for more in words]
-    assert found == [False, False, False, True, True]
 
 
 def test_the_best_snapshot() -> None:

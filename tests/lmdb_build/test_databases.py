@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import multiprocessing
 import os
 import subprocess
 import sys
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from lmdb_build.cli import main
-from lmdb_build.databases import _Workers, read_pairs
+from lmdb_build.databases import read_pairs
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
 from optional_packages import leveldb
@@ -308,19 +307,3 @@ def test_the_script_works_from_any_folder_without_torch(tmp_path: Path, pair_lis
     refused = script("convert_pairs_lmdb", PNG, pair_list, "pairs_lmdb")
     assert refused.returncode == 1
     assert "Traceback" not in refused.stderr
-
-
-@pytest.mark.parametrize(("system", "method"), [("linux", "fork"), ("darwin", "spawn")])
-def test_workers_are_forked_on_linux_only(system: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On macOS, a forked process can crash in system libraries that its parent has used."""
-
-    class Started(Exception):
-        pass
-
-    def start(name: str) -> None:
-        raise Started(name)
-
-    monkeypatch.setattr(sys, "platform", system)
-    monkeypatch.setattr(multiprocessing, "get_context", start)
-    with pytest.raises(Started, match=method):
-        _Workers(2).__enter__()

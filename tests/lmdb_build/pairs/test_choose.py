@@ -12,8 +12,6 @@ from lmdb_build.pairs.by_pose import PoseRule, PoseSource
 from lmdb_build.pairs.choose import (
     NEGATIVE,
     POSITIVE,
-    Wanted,
-    choose_pairs,
     find_pairs,
     split_by_group,
     split_by_time,
@@ -22,7 +20,6 @@ from lmdb_build.pairs.list_file import read_pair_list
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import Poses
 
 
 def wander(name: str, count: int, seed: int, start_s: float = 0.0) -> ImageSequence:
@@ -55,7 +52,7 @@ def as_sets(pairs: np.ndarray) -> set[tuple[int, int]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["time", "group"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("lengths", [(120, 90, 110), (61, 200, 40, 77)])
 def test_lists_are_balanced_disjoint_and_labeled_by_the_rule(
     tmp_path: Path, by: str, seed: int, lengths: tuple[int, ...]
@@ -207,39 +204,3 @@ def test_sampling_finds_the_same_pairs_as_enumeration(monkeypatch: pytest.Monkey
     # More than there are: drawing gives up, and the count is exact.
     exhausted = find_pairs(source, images, {POSITIVE: 10**6}, np.random.default_rng(0))
     assert as_sets(exhausted[POSITIVE]) == as_sets(everything_there[POSITIVE])
-
-
-def test_pairs_are_drawn_evenly() -> None:
-    """Each of the 780 pairs of 40 images that are all one place is drawn as often as any other."""
-    still = wander("s", 40, 1)
-    source = PoseSource([still], ["s"], PoseRule(max_distance_m=1e3, max_angle_deg=181))
-    drawn = np.zeros((40, 40))
-    for seed in range(200):
-        pairs = find_pairs(source, everything(source), {POSITIVE: 78}, np.random.default_rng(seed))[POSITIVE]
-        drawn[pairs[:, 0], pairs[:, 1]] += 1
-    times = drawn[np.triu_indices(40, 1)]
-    assert times.sum() == 200 * 78
-    assert times.min() > 3
-    assert times.max() < 45
-    assert abs(times.std() - 4.24) < 0.6  # binomial: sqrt(200 * 0.1 * 0.9)
-
-
-def test_given_hard_negatives_are_all_used_once() -> None:
-    source = pose_source()
-    all_negatives = find_pairs(source, everything(source), {NEGATIVE: 40}, np.random.default_rng(9))[NEGATIVE]
-    chosen = choose_pairs(
-        source, everything(source), Wanted(100, hard_negatives=all_negatives), np.random.default_rng(0), "train"
-    )
-    negatives = np.column_stack([chosen.first, chosen.second])[chosen.labels == NEGATIVE]
-    assert as_sets(all_negatives) <= as_sets(negatives)
-    assert len(as_sets(negatives)) == 50
-
-
-def test_a_pose_across_the_limit_changes_the_label() -> None:
-    """The choice asks the rule: a source with other limits labels otherwise."""
-    source, wide = pose_source(), pose_source(rule=PoseRule(max_distance_m=4, max_angle_deg=40))
-    first, second = np.triu_indices(len(source.names), 1)
-    assert (wide.judge(first, second) == POSITIVE).sum() > (source.judge(first, second) == POSITIVE).sum()
-    a, b = Poses(source.poses.positions[first], source.poses.quaternions[first]), source.poses[second]
-    within = source.groups[first] == source.groups[second]
-    assert np.array_equal(source.judge(first, second) == POSITIVE, same_place(a, b) & within)

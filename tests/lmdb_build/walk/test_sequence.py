@@ -104,38 +104,7 @@ def test_every_lap_revisits_the_same_places(sequence: ImageSequence) -> None:
         assert again.mean() > 0.9
 
 
-def test_images_of_the_same_place_are_similar(folder: Path, sequence: ImageSequence) -> None:
-    thumbnails = []
-    for path in sequence.paths:
-        picture = cv2.imread(str(path))
-        assert picture is not None
-        small = cv2.resize(picture, (16, 12), interpolation=cv2.INTER_AREA).astype(float).ravel()
-        thumbnails.append((small - small.mean()) / small.std())
-    alike = np.array(thumbnails) @ np.array(thumbnails).T / len(thumbnails[0])
-    assert sequence.stamps is not None
-    apart = np.abs(sequence.stamps[:, None] - sequence.stamps) > 10
-    poses = sequence.known_poses()
-    truth = same_place_matrix(poses, poses)
-    nearly_the_same_view = same_place_matrix(poses, poses, 0.5, 6) & apart
-    other = np.median(alike[~truth])
-    assert np.median(alike[nearly_the_same_view]) > 0.6
-    assert np.median(alike[truth & apart]) > other + 0.3
-    assert other < 0.2
-
-
-def test_laps_differ_in_light_and_position(sequence: ImageSequence) -> None:
-    poses = sequence.known_poses()
-    truth = same_place_matrix(poses, poses)
-    later = np.flatnonzero(np.arange(SMALL.frames) >= SMALL.frames // SMALL.laps)
-    aside = []
-    for index in later:
-        first_lap = np.flatnonzero(truth[index, : SMALL.frames // SMALL.laps])
-        if len(first_lap):
-            aside.append(np.linalg.norm(poses.positions[first_lap] - poses.positions[index], axis=1).min())
-    assert 0.03 < np.median(aside) < 0.6
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_corners_appear_at_their_projected_positions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     texture = np.zeros((256, 256, 3), np.uint8)
@@ -157,14 +126,6 @@ def test_corners_appear_at_their_projected_positions(seed: int) -> None:
     np.testing.assert_allclose(found, expected, atol=0.25)
 
 
-def test_texture_columns_run_to_the_right_and_rows_down() -> None:
-    texture = np.zeros((64, 64, 3), np.uint8)
-    texture[:32, :32], texture[:32, 32:], texture[32:, :32] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
-    picture = drawn(flat_house(facing_quad(2.0, 1.2, texture)))
-    for (row, column), color in (((45, 65), [1, 0, 0]), ((45, 95), [0, 1, 0]), ((75, 65), [0, 0, 1])):
-        assert (picture[row, column] > 200).tolist() == [bool(part) for part in color]
-
-
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_nearer_surfaces_hide_others_in_any_order(order: tuple[int, int]) -> None:
     near = facing_quad(2.0, 0.5, np.full((32, 32, 3), 200, np.uint8))
@@ -175,15 +136,8 @@ def test_nearer_surfaces_hide_others_in_any_order(order: tuple[int, int]) -> Non
     assert 0 < picture[10, 10, 0] < 70
 
 
-def test_surfaces_are_invisible_from_behind() -> None:
-    quad = facing_quad(2.0, 1.0, np.full((32, 32, 3), 200, np.uint8))
-    turned = replace(quad, origin=quad.origin + quad.right, right=-quad.right)
-    assert not drawn(flat_house(turned)).any()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_house_has_no_holes(seed: int) -> None:
-    house = build_house(seed)
+def test_the_house_has_no_holes() -> None:
+    house = build_house(0)
     white = [replace(quad, texture=np.full((32, 32, 3), 255, np.uint8)) for quad in house.quads]
     renderer = Renderer(replace(house, quads=white), CAMERA, np.full((4, 3), 2.0))
     for index in range(0, len(house.way), 40):
@@ -195,9 +149,9 @@ def test_the_house_has_no_holes(seed: int) -> None:
             assert (picture == 255).mean() > 0.9995
 
 
-@pytest.mark.parametrize("rooms", [4, 6, 8])
+@pytest.mark.parametrize("rooms", [4, 8])
 def test_the_path_visits_every_room_and_avoids_boxes(rooms: int) -> None:
-    for seed in range(4):
+    for seed in range(2):
         house = build_house(seed, rooms)
         for room in house.rooms:
             assert ((house.way > room.corners[0]) & (house.way < room.corners[1])).all(axis=1).any()
@@ -207,13 +161,6 @@ def test_the_path_visits_every_room_and_avoids_boxes(rooms: int) -> None:
             ends = np.array([top.origin, top.origin + top.right + top.down])[:, :2]
             gap = np.maximum(np.maximum(ends.min(axis=0) - house.way, house.way - ends.max(axis=0)), 0)
             assert np.linalg.norm(gap, axis=1).min() >= 0.5
-
-
-def test_the_camera_is_upright(sequence: ImageSequence) -> None:
-    axes = Rotation.from_quat(sequence.known_poses().quaternions).as_matrix()
-    assert (axes[:, 2, 1] < -0.98).all()  # y points down
-    assert (np.abs(axes[:, 2, 0]) < 0.05).all()  # x is level
-    assert (np.abs(sequence.known_poses().positions[:, 2] - 1.5) < 0.1).all()
 
 
 @pytest.mark.parametrize(

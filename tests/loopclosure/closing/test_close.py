@@ -201,25 +201,6 @@ def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert len(read_poses(tmp_path / "out" / "closed.txt").poses) == FRAMES // 3
 
 
-def test_missing_loops_are_reported_with_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "out").mkdir()
-    expected = "out/lops.csv: no such file; expected the loops.csv that loopclosure detect writes"
-    with pytest.raises(InputError) as fault:
-        read_loops(Path("out/lops.csv"), ImageSequence.of_files([Path("a.png")]))
-    assert str(fault.value) == f"{expected}; relative paths start from {tmp_path}"
-    with pytest.raises(InputError, match=f'; "{tmp_path}" has no "gone"$'):
-        read_loops(tmp_path / "gone" / "loops.csv", ImageSequence.of_files([Path("a.png")]))
-
-
-@pytest.mark.parametrize("cell", ["", "-1", "1.5", "x", "\u00b2", "9" * 5000])
-def test_an_id_is_a_whole_number(cell: str, tmp_path: Path) -> None:
-    table = tmp_path / "l.csv"
-    table.write_text(f"query_id,match_id\n{cell},1\n")
-    with pytest.raises(InputError, match=r"l\.csv:2:1: no frame has the number"):
-        read_loops(table, ImageSequence.of_files([Path("a.png"), Path("b.png")]))
-
-
 def test_a_row_that_was_cut_is_refused(tmp_path: Path) -> None:
     table = tmp_path / "l.csv"
     table.write_text("query_id,match_id,score,query_name,match_name\n2,1,0.5,c.png,b.png\n2,1")

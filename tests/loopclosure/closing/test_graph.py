@@ -79,13 +79,6 @@ def test_false_loops_do_not_distort_the_path(false: int) -> None:
     np.testing.assert_allclose(solution.poses[:, :3], clean.poses[:, :3], atol=0.01)
 
 
-def test_without_loops_the_path_is_unchanged() -> None:
-    path = drifted(laps(), 2, seed=1)
-    solution = solve(path, odometry_edges(path), [])
-    np.testing.assert_allclose(solution.poses[:, :3], path[:, :3], atol=1e-12)
-    assert solution.accepted.shape == (0,)
-
-
 def test_drift_follows_from_its_seed_and_grows_with_its_size() -> None:
     truth = laps()
     np.testing.assert_array_equal(drifted(truth, 2, seed=5), drifted(truth, 2, seed=5))

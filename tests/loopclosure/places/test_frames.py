@@ -1,10 +1,7 @@
 """Sources of frames: order, selection, and errors for broken ones."""
 
 import csv
-import os
 import struct
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -18,12 +15,10 @@ from loopclosure.errors import InputError
 from loopclosure.places.frames import (
     Selection,
     image_paths,
-    is_video,
     live_frames,
     read_bgr,
     video_frames,
     video_length,
-    write_picture,
 )
 from loopclosure.places.sequences import read_sequence
 from netspec.errors import SpecError
@@ -111,22 +106,6 @@ def test_video(tmp_path):
         next(iter(video_frames(tmp_path / "none.avi")))
     with pytest.raises(InputError, match="is a folder, and neither a video nor a ROS bag"):
         list(video_frames(tmp_path))
-
-
-def test_a_video_whose_name_is_not_utf8_is_refused(tmp_path):
-    for read in (video_length, lambda path: next(video_frames(path))):
-        with pytest.raises(InputError, match="cannot open a video if its path is not UTF-8; rename it"):
-            read(tmp_path / os.fsdecode(b"caf\xe9.mp4"))
-
-
-def test_pictures_are_written_into_a_folder_of_any_name(tmp_path):
-    folder = tmp_path / os.fsdecode(b"caf\xe9")
-    folder.mkdir()
-    image = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
-    write_picture(folder / "a.png", image, cv2.IMWRITE_PNG_COMPRESSION, 1)
-    assert np.array_equal(read_bgr(folder / "a.png"), image)
-    with pytest.raises(SpecError, match="cannot be written: No such file or directory"):
-        write_picture(folder / "nowhere" / "a.png", image)
 
 
 THUMBNAILS = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
@@ -245,16 +224,6 @@ def test_a_video_that_cannot_be_decoded_is_reported(begin: bytes, tmp_path: Path
             read(path)
 
 
-@pytest.mark.slow
-def test_a_video_that_cannot_be_decoded_prints_one_line(tmp_path: Path) -> None:
-    """FFmpeg prints its own messages unless they are disabled before the first video of a process."""
-    (tmp_path / "drive.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42\x00\x00\x00\x00mp42isom" + bytes(range(256)) * 8)
-    words = [sys.executable, "-m", "loopclosure", "detect", str(tmp_path / "drive.mp4"), "--out", str(tmp_path / "out")]
-    done = subprocess.run(words, check=False, capture_output=True, text=True)
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(f"{tmp_path}/drive.mp4: cannot be decoded as a video by OpenCV ")
-
-
 def stalled(path: Path, parts: list[tuple[int, float]]) -> None:
     """Give the frames of an .mp4 other durations: (how many frames, how many times as long) for each part."""
     data = path.read_bytes()
@@ -280,19 +249,6 @@ def test_the_times_of_a_video_are_its_own(tmp_path: Path) -> None:
     stalled(path, [(10, 0.5), (10, 1.5)])
     expected = [*(0.25 * i for i in range(10)), *(2.5 + 0.75 * i for i in range(10))]
     np.testing.assert_allclose([seconds for seconds, _ in video_frames(path)], expected, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["drive.ts", "drive.3gp", "drive.wmv", "drive"])
-def test_a_video_may_have_any_name(name: str, tmp_path: Path) -> None:
-    video = write_video(tmp_path / "drive.avi").rename(tmp_path / name)
-    assert is_video(video)
-    assert len(read_sequence(video)) == len(list(video_frames(video)))
-
-
-def test_what_is_no_video(tmp_path: Path) -> None:
-    (tmp_path / "list.txt").write_text("a.png\n")
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
-    assert not any(is_video(tmp_path / name) for name in ("list.txt", "a.png", "gone", "."))
 
 
 @pytest.mark.parametrize(

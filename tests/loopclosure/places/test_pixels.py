@@ -149,9 +149,3 @@ def test_a_dark_image_beside_a_bright_one_stays_dark(tmp_path: Path) -> None:
         assert cv2.imwrite(str(tmp_path / f"{name}.png"), image)
     assert [read_bgr(tmp_path / f"image_{number}.png").max() for number in (1, 2)] == [250, 10]
     assert [image_of(message("mono16", image), least=12).max() for image in (bright, dark)] == [250, 10]
-
-
-def test_images_of_8_bits_are_read_as_before(tmp_path: Path) -> None:
-    for name, image in (("a.png", PICTURE), ("b.png", GRAY)):
-        assert cv2.imwrite(str(tmp_path / name), image)
-        np.testing.assert_array_equal(read_bgr(tmp_path / name), cv2.imread(str(tmp_path / name)))

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopclosure.cli import main
 from loopclosure.errors import InputError
 from loopclosure.places.datasets import load_sequence, load_traverses
 from loopclosure.places.frames import Selection
@@ -87,17 +86,6 @@ def test_an_unknown_distortion_is_no_camera(tmp_path: Path) -> None:
     same_path(sequence.poses, path())
 
 
-def test_a_comment_in_another_encoding_leaves_the_poses(tmp_path: Path) -> None:
-    folder = write_euroc(tmp_path)
-    sensor = folder / "mav0/cam0/sensor.yaml"
-    text = sensor.read_bytes()
-    sensor.write_bytes("# Z\u00fcrich\n".encode("latin-1") + text)
-    same_path(read_sequence(folder).with_poses().poses, path())
-    sensor.write_bytes(text.replace(b"data: [0,", b"data: [\xff,"))
-    with pytest.raises(InputError, match=r"sensor\.yaml"):
-        read_sequence(folder).with_poses()
-
-
 @pytest.mark.parametrize("value", ["99999999999999999999", "1e999", "nan", "0.5"])
 def test_without_a_mount_there_are_no_poses(value: str, tmp_path: Path) -> None:
     folder = write_euroc(tmp_path)
@@ -139,14 +127,6 @@ def test_poses_that_cannot_be_read_do_not_stop_what_needs_none(write: Callable[[
         assert [remark.endswith("; continued without poses") for remark in sequence.remarks()] == [True]
         with pytest.raises(InputError, match=file.name):
             sequence.with_poses()
-
-
-def test_missing_files_of_a_sequence_are_reported(tmp_path: Path) -> None:
-    folder = write_euroc(tmp_path)
-    for name in ("x" * 5000, "a\0b"):
-        (folder / "mav0/cam0/data.csv").write_text(f"7,{name}\n")
-        with pytest.raises(InputError, match=r"data\.csv:1:1: no such image|is not a text file"):
-            read_sequence(folder)
 
 
 @pytest.mark.parametrize(("camera", "aside"), [("image_0", 0.0), ("image_2", -0.06)])
@@ -234,60 +214,6 @@ def test_errors_of_a_benchmark_are_reported(tmp_path: Path) -> None:
         benchmark_parts(folder)
     with pytest.raises(InputError, match="has no folder query or queries or Query with the queries"):
         benchmark_parts(tmp_path)
-
-
-class Harmful:
-    """What a pickle may run when it is read."""
-
-    def __reduce__(self) -> tuple:
-        return (Path.touch, (Path("harmed"),))
-
-
-def test_lists_of_matches_execute_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    rows = np.empty(2, dtype=object)
-    rows[:] = [Harmful(), [1]]
-    np.save("truth.npy", rows)
-    with pytest.raises(InputError, match=r"truth\.npy: cannot be read"):
-        read_matches("truth.npy", 2, 2)
-    assert not Path("harmed").exists()
-
-
-@pytest.mark.slow
-def test_evaluate_reads_them_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    poses = tmp_path / "poses.txt"
-    poses.write_text(tum_rows(path()))
-    euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
-    video, benchmark = write_video(tmp_path / "v.avi"), write_benchmark(tmp_path / "b")
-    lines = [
-        f"{euroc}",
-        f"kitti:{kitti}",
-        f"{video},poses={poses}",
-        f"images:{kitti / 'image_0'},poses={poses}",
-        f"nordland:{benchmark}",
-        f"traverses:{benchmark}/query,references={benchmark}/ref,truth={benchmark}/ground_truth.json",
-    ]
-    for number, line in enumerate(lines):
-        out = tmp_path / f"out{number}"
-        assert main(["evaluate", *line.split(), "--method", "thumbnails", "--out", str(out)]) == 0
-        assert capsys.readouterr().err == ""
-        assert (out / "report.html").is_file()
-
-
-def test_images_with_both_a_mask_and_poses_are_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = "evaluate images:x,truth=t.npy,poses=p.txt --method thumbnails --out o"
-    assert main(line.split()) == 2
-    assert "give either truth or poses, not both" in capsys.readouterr().err
-    line = "evaluate tum:x,pose-form=kitti --method thumbnails --out o"
-    assert main(line.split()) == 2
-    assert "pose-form needs poses" in capsys.readouterr().err
-
-
-def test_detect_accepts_euroc_with_its_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_euroc(tmp_path)
-    line = ["detect", str(folder), "--threshold", "-0.001", "--exclude-recent", "10", "--out", str(tmp_path / "found")]
-    assert main([*line, "--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]) == 0
-    assert "24 of 24 loops are the same place by their poses" in capsys.readouterr().out
 
 
 def test_a_selection_counts_frames_without_a_pose(two_laps, tmp_path):

@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 from given_scores import GivenScores
-from loopclosure.detector.decision import LoopResult
 from loopclosure.evaluate import Judgment, Outcome, evaluate
 from loopclosure.methods.named import named_methods
 from loopclosure.places.datasets import load_sequence, load_traverses
-from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
-from loopclosure.report.drive import write_drive
 from loopclosure.report.files import measures_text
 from loopclosure.report.page import write_report
 from loopclosure.report.plots import best_true_references, decisions
@@ -123,18 +120,6 @@ def test_figures_are_the_same_in_json_and_text(evaluation, folder):
     assert summary["queries_with_a_loop"] == 20
 
 
-def test_times_per_frame_exclude_training(folder):
-    net, noise, _ = json.loads((folder / "report.json").read_text())["methods"]
-    assert noise["milliseconds_a_frame"] == pytest.approx({"looking": 10.0})
-    assert net["milliseconds_a_frame"]["features"] == pytest.approx(4.0)
-
-
-def test_the_same_evaluation_gives_the_same_bytes(evaluation, folder, tmp_path):
-    write_report(evaluation, tmp_path, "A title", "loopclosure evaluate --x")
-    for path in folder.iterdir():
-        assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name
-
-
 def test_decisions_at_the_best_f1(evaluation):
     truth = evaluation.data.truth
     found, false, missed = decisions(evaluation.outcomes[0], truth)
@@ -159,20 +144,6 @@ def test_decisions_of_a_method_that_decides_itself(evaluation):
         judged = Judgment.of(scores, truth)
         found, false, _ = decisions(Outcome("auto", scores, judged, None, {}, (), [], answer=answer), truth)
         assert (found.tolist(), false.tolist()) == ([*range(6)], wrong)
-
-
-def test_images_that_cannot_be_read_are_not_shown(tmp_path):
-    """With features from a file, they are first read for the report."""
-    files = [tmp_path / f"{i}.png" for i in range(30)]
-    for i, file in enumerate(files):
-        cv2.imwrite(str(file), np.full((12, 16, 3), 8 * i, np.uint8))
-    results = [LoopResult(i, [(i - 15, 0.5)], i - 15, "accepted", 0.5) for i in range(15, 30)]
-    none = [LoopResult(i, [], None, "no candidate", float("-inf")) for i in range(15)]
-    for broken in (files[::2], files):
-        for file in broken:
-            file.write_bytes(file.read_bytes()[:40])
-        write_drive(tmp_path / "report.html", [*none, *results], [], ImageSequence.of_files(files), "detect")
-        assert "15 of 30 frames show a place" in (tmp_path / "report.html").read_text()
 
 
 def test_two_traverses_without_positions(tmp_path):
