@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -87,9 +89,18 @@ def here(net: Net, inputs: Arrays) -> dict[str, np.ndarray]:
 def onnx_model(net: Net, **options: Any) -> tuple[Any, list[str]]:
     """Return the exported ONNX model of a net, and its notes."""
     onnx = pytest.importorskip("onnx", reason=ONNX_EXTRA)
+    _keep_functions()
     with tempfile.TemporaryDirectory() as folder:
         notes = export_onnx(net, Path(folder) / "net.onnx", **options)
         return onnx.load(Path(folder) / "net.onnx"), notes
+
+
+@cache
+def _keep_functions() -> None:
+    """Read the functions of onnxscript once, not in each export, which would take half of its time."""
+    registration = import_module("torch.onnx._internal.exporter._registration")
+    apis = registration.onnxscript_apis
+    apis.get_torchlib_ops = cache(apis.get_torchlib_ops)
 
 
 def in_onnxruntime(model: Any, inputs: Arrays) -> dict[str, np.ndarray]:

@@ -38,6 +38,7 @@ from netspec.cli.arguments import (
 from netspec.errors import SpecError
 from netspec.files.limits import amount
 from netspec.files.whole_file import whole_file
+from netspec.graph.options import OPSET
 from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
@@ -215,9 +216,9 @@ WRITTEN = {
     "torch": "the source of a PyTorch module",
     "safetensors": "weights",
 }
-EXPORT = """Write a net and its weights in another format.
+EXPORT = f"""Write a net and its weights in another format.
 
---to onnx         an ONNX model (opset 21), with dynamic batch, height and width if the net allows it;
+--to onnx         an ONNX model (opset {OPSET}), with dynamic batch, height and width if the net allows it;
                   weights of more than 2 GB go into a second file
 --to torch        the source of a PyTorch module, OUT.py, and its weights, OUT.safetensors
 --to safetensors  the weights alone: LAYER.INDEX, in Caffe's order

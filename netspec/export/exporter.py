@@ -1,67 +1,38 @@
-"""How a layer is exported: by the exporter of its class, or by attributes of the class itself.
+"""How a layer is exported: as an expression of PyTorch (expression.py), from which its ONNX nodes are made too.
 
-The exporters are in ``layers`` and ``dialects``, a module for each module of netspec that has layers. One says what the
-layer computes in PyTorch, as an expression (expression.py), and in ONNX, as nodes of a graph (formats/onnx.py)::
+The expressions are in ``layers`` and ``dialects``, a function for each class of layers::
 
     @exports(Swish)
-    class SwishExport(Exporter):
-        def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-            return x * call(torch.sigmoid, self.layer.beta * x)
+    def swish(layer: Any, code: TorchCode, x: Expression) -> Expression:
+        return x * call(torch.sigmoid, layer.beta * x)
 
-        def to_onnx(self, graph: OnnxGraph, x: str) -> str:
-            gate = graph.node("Sigmoid", graph.node("Mul", x, graph.constant(self.layer.beta)))
-            return graph.node("Mul", x, gate)
+It gets the expressions of the bottoms and returns that of the top, or one for each top. It must compute the same as
+``forward``, for every dynamic size, and so must its gradient. It reads attributes of the layer, and raises
+:func:`refusal` for what it does not support. A layer outside netspec has it as a method, ``to_torch(self, code, x)``.
 
-A function that torch does not have stands at the end of the module, and is called like one; the exported source gets a
-copy of it. It may use torch, F and other such functions, and makes its tensors on the device of its arguments.
+A helper that torch does not have stands at the end of the module, and is called like a function of torch; the exported
+source gets a copy of it. It may use torch, F and other such helpers, and makes its tensors on the device of its
+arguments.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable
+from functools import cache, partial
 from importlib import import_module
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from netspec.errors import SpecError
-from netspec.export.expression import Plain
 from netspec.layers.contract.base import Layer
 
-E = TypeVar("E", bound="type[Exporter]")
-EXPORTERS: dict[str, type[Exporter]] = {}  # by the path of the layer's class
-
-
-class Exporter:
-    """Base of exporters: a layer's form in ONNX and in PyTorch, as one operator and one call, or as methods.
-
-    If a class has both, the method is used. The exported form must compute the same as ``forward``, for every dynamic
-    size. The methods are those of a layer outside netspec too::
-
-        def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]
-        def to_torch(self, code: TorchCode, *bottoms: Expression) -> Expression | Sequence[Expression]
-
-    ``to_onnx`` writes the layer into an ONNX graph and returns the values of its tops; ``bottoms`` are the values of
-    its bottoms. ``to_torch`` does the same with expressions. Both raise SpecError for what they do not support.
-    """
-
-    onnx_op: ClassVar[str]  # an ONNX operator, whose inputs are the bottoms
-    onnx_attributes: ClassVar[Sequence[str]]  # the operator's attributes; the layer has them by the same names
-    torch_call: ClassVar[Plain]  # a function of torch, and the attributes of the layer that it takes
-    not_exported: ClassVar[str]  # why the layer cannot be exported
-
-    def __init__(self, layer: Any) -> None:
-        self.layer = layer
-
-    def refusal(self, target: str, reason: str = "") -> SpecError:
-        """Return the error for a layer that cannot be exported, with this reason or the one of its class."""
-        reason = reason or getattr(self, "not_exported", "")
-        return self.layer.error(f"cannot be exported to {target}: {reason or 'its class does not support it'}")
+E = TypeVar("E", bound=Callable[..., Any])
+EXPORTERS: dict[str, Callable[..., Any]] = {}  # by the path of the layer's class
 
 
 def exports(*layers: type[Layer] | str) -> Callable[[E], E]:
-    """Class decorator: register an exporter for classes of layers.
+    """Decorator: register the expression of classes of layers.
 
     Classes of dialects are given by their paths, because a dialect may be imported only if a net uses it.
     """
@@ -79,45 +50,36 @@ def path_of(layer: type[Layer]) -> str:
 
 
 @cache
-def _exporters() -> dict[str, type[Exporter]]:
+def _exporters() -> dict[str, Callable[..., Any]]:
     for package in ("layers", "dialects"):  # which import this module
         import_module(f"netspec.export.{package}")
     return EXPORTERS
 
 
-def exporter_class(layer: type[Layer]) -> type[Exporter] | None:
-    """Return the exporter that is registered for exactly this class, or None."""
-    return _exporters().get(path_of(layer))
+def exporter_of(layer: Layer) -> Callable[..., Any]:
+    """Return what writes a layer: a function of a TorchCode and of expressions of the bottoms.
 
-
-@cache
-def _owner(cls: type[Layer], name: str) -> type[Layer] | None:
-    """Return the class of layers that has an attribute, by its exporter or itself, for the ``forward`` of ``cls``.
-
-    A subclass with its own ``forward`` does not inherit how its base class is exported.
+    A subclass with its own ``forward`` does not inherit how its base class is exported. Raises SpecError if the layer
+    cannot be exported.
     """
-    owner = next((one for one in cls.__mro__ if hasattr(exporter_class(one), name) or name in vars(one)), None)
-    return owner if owner is not None and getattr(owner, "forward", None) in (cls.forward, Layer.forward) else None
+    cls = type(layer)
+    known = _exporters()
+    owner = next((one for one in cls.__mro__ if path_of(one) in known or "to_torch" in vars(one)), None)
+    if owner is None or getattr(owner, "forward", None) not in (cls.forward, Layer.forward):
+        raise refusal(layer, getattr(layer, "not_exported", "its class does not say how"))
+    return partial(known[path_of(owner)], layer) if path_of(owner) in known else layer.to_torch
 
 
-def exported(layer: Layer, name: str) -> Any:
-    """Return an attribute of a layer's exporter, or of the layer itself; None if neither has it."""
-    owner = _owner(type(layer), name)
-    if owner is None:
-        return None
-    exporter = exporter_class(owner)
-    return getattr(exporter(layer) if exporter is not None and hasattr(exporter, name) else layer, name)
+def refusal(layer: Layer, reason: str) -> SpecError:
+    """Return the error for a layer that cannot be exported."""
+    return layer.error(f"cannot be exported: {reason}")
 
 
 def layer_notes(layers: Iterable[Layer]) -> list[str]:
     """Return what the user of an exported net must know of its layers, in lines."""
-    return [str(layer.error(note)) for layer in layers if (note := exported(layer, "export_note"))]
-
-
-def refusal(layer: Layer, target: str) -> SpecError:
-    """Return the error for a layer that cannot be exported, with the reason of its class or of a base class."""
-    reasons = (getattr(each, "not_exported", "") for cls in type(layer).__mro__ for each in (cls, exporter_class(cls)))
-    return Exporter(layer).refusal(target, next(filter(None, reasons), ""))
+    lost = "starts at zero in every run; in Caffe it continues in the next run if cont is 1"
+    recurrent = [layer for layer in layers if getattr(layer, "state_names", ()) and not layer.exposed]
+    return [str(layer.error(f"its state ({', '.join(layer.state_names)}) {lost}")) for layer in recurrent]
 
 
 def rounded(value: float) -> float:

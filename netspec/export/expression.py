@@ -8,7 +8,7 @@ of its own module, is called by :func:`call`::
     return code.module(nn.Linear, 3, 4, state={"weight": w, "bias": b})(x.flatten(1))
 
 An expression is read by the printer of the PyTorch source (formats/source.py), and by :func:`evaluate`
-(formats/module.py).
+(formats/onnx.py).
 """
 
 from __future__ import annotations
@@ -143,16 +143,14 @@ def _same(tensor: torch.Tensor, other: torch.Tensor) -> bool:
     return tensor.stride() == other.stride() and torch.equal(tensor, other)
 
 
-class Plain:
-    """A call as data, for a layer that is one: its bottoms, then attributes of the layer, given by their names."""
+def plain(function: Callable[..., Any], *attributes: str, **options: str) -> Callable[..., Call]:
+    """Return the exporter of layers that are one call: of their bottoms, then of attributes, given by their names."""
 
-    def __init__(self, function: Callable[..., Any], *attributes: str, **options: str) -> None:
-        self.function, self.attributes, self.options = function, attributes, options
+    def write(layer: Any, code: Any, *bottoms: Expression) -> Call:
+        named = {name: getattr(layer, attribute) for name, attribute in options.items()}
+        return call(function, *bottoms, *(getattr(layer, name) for name in attributes), **named)
 
-    def of(self, layer: Any, bottoms: tuple[Expression, ...]) -> Call:
-        """Return the call for a layer."""
-        options = {name: getattr(layer, attribute) for name, attribute in self.options.items()}
-        return call(self.function, *bottoms, *(getattr(layer, name) for name in self.attributes), **options)
+    return write
 
 
 def call(function: Callable[..., Any], *args: Any, **options: Any) -> Call:

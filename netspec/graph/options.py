@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from netspec.graph.speed import Speed
 
 TORCH, ONNXRUNTIME, OPENVINO = ENGINES = ("torch", "onnxruntime", "openvino")  # engines
+OPSET = 18  # of exported ONNX models: that of ONNX 1.13 (2022); torch.onnx writes no older one
 FP32, BF16 = PRECISIONS = ("fp32", "bf16")  # number formats
 FOLD, FUSE, SKIP, PACK = PASSES = ("fold", "fuse", "skip", "pack")  # see netspec/fast/steps.py
 

@@ -145,6 +145,8 @@ def interruptible() -> Iterator[None]:
         for number in before:
             signal.signal(number, interrupt)
         yield
+        if received:  # Python loses an exception that is raised in a finalizer
+            raise Interrupted(*received)
     except Exception:
         if received:  # a module that was being imported may have turned the interrupt into another error
             raise Interrupted(*received) from None

@@ -1,249 +1,142 @@
-"""Exporters of layers of netspec/dialects/blocks."""
+"""The expressions of layers of netspec/dialects/blocks, faces, video and yolo."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torch.nn.functional as F
-from typing_extensions import override
+from torch import nn
 
-from netspec.export.exporter import Exporter, exports, rounded
-from netspec.export.expression import Expression, Plain, call, with_axes
-from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.exporter import exports, refusal, rounded
+from netspec.export.expression import Expression, call, plain, with_axes
 from netspec.export.formats.torch_code import TorchCode
-from netspec.export.layers.common import DropoutExport
-from netspec.export.layers.normalization import BatchNormExport
-from netspec.export.layers.vision import ConvolutionExport
-from netspec.layers.vision import pooling, windows
+from netspec.export.layers.common import dropout
+from netspec.export.layers.normalization import batch_norm, by_statistics, is_module
+from netspec.export.layers.vision import convolved, each, means_of_padded
+from netspec.layers.vision import pooling
 from netspec.proto.schema import TRAIN, value
 
 SLOPES, BIASES = 3, 4  # blobs of NVIDIA's BatchNorm
 
+exports("netspec.dialects.blocks.blocks.ShuffleChannel")(plain(F.channel_shuffle, "group"))
+exports("netspec.dialects.faces.happynear.Cosine")(plain(torch.cos))
+exports("netspec.dialects.faces.happynear.Flip")(plain(torch.Tensor.flip, "axes"))
+
 
 @exports("netspec.dialects.blocks.blocks.Axpy")
-class AxpyExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        a, x, y = bottoms
-        missing = list(range(len(self.layer.bottom_shapes[0]), len(self.layer.bottom_shapes[1])))
-        if missing:
-            a = graph.node("Unsqueeze", a, graph.constant(missing))
-        return graph.node("Add", graph.node("Mul", a, x), y)
-
-    def to_torch(self, code: TorchCode, a: Expression, x: Expression, y: Expression) -> Expression:
-        return with_axes(a, len(self.layer.bottom_shapes[1]) - len(self.layer.bottom_shapes[0])) * x + y
-
-
-@exports("netspec.dialects.blocks.blocks.ShuffleChannel")
-class ShuffleChannelExport(Exporter):
-    torch_call = Plain(F.channel_shuffle, "group")
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        layer = self.layer
-        channels = layer.bottom_shapes[0][1]
-        grouped = graph.reshape(bottoms[0], [0, layer.group, channels // layer.group, -1])
-        return graph.reshape_to_top(graph.node("Transpose", grouped, perm=[0, 2, 1, 3]))
+def axpy(layer: Any, code: TorchCode, a: Expression, x: Expression, y: Expression) -> Expression:
+    return with_axes(a, len(layer.bottom_shapes[1]) - len(layer.bottom_shapes[0])) * x + y
 
 
 @exports("netspec.dialects.blocks.blocks.Interp")
-class InterpExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        param, (data, *like) = value(self.layer.param, "interp_param"), bottoms
-        if param.pad_beg or param.pad_end:
-            start, end = graph.constant([-param.pad_beg] * 2), graph.constant([param.pad_end or 2**62] * 2)
-            data = graph.node("Slice", data, start, end, graph.constant([2, 3]))
-        if like:
-            size = graph.shape_of(like[0], 2, 4)
-        elif param.HasField("height"):
-            size = graph.constant([param.height, param.width])
-        else:
-            one, zoom = graph.constant([1, 1]), graph.constant([param.zoom_factor] * 2)
-            last = graph.node("Sub", graph.shape_of(data, 2, 4), one)
-            steps = graph.node("Mul", graph.node("Div", last, graph.constant([param.shrink_factor] * 2)), zoom)
-            size = graph.node("Add", steps, one)
-        sizes = graph.node("Concat", graph.shape_of(data, 0, 2), size, axis=0)
-        grid = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
-        return graph.node("Resize", data, "", "", sizes, **grid)
-
-    def to_torch(self, code: TorchCode, x: Expression, *like: Expression) -> Expression:
-        param = value(self.layer.param, "interp_param")
-        cut = (param.pad_beg, param.pad_end) * 2
-        if any(cut):
-            x = call(F.pad, x, cut)
-        if like:
-            size = like[0].shape[2:]
-        elif None not in code.sizes(0)[2:] or param.HasField("height"):
-            size = tuple(self.layer.top_shapes[0][2:])
-        else:
-            size = call(zoomed_size, x, param.shrink_factor, param.zoom_factor)
-        return call(F.interpolate, x, size=size, mode="bilinear", align_corners=True)
+def interp(layer: Any, code: TorchCode, x: Expression, *like: Expression) -> Expression:
+    param = value(layer.param, "interp_param")
+    cut = (param.pad_beg, param.pad_end) * 2
+    x = call(F.pad, x, cut) if any(cut) else x
+    if like:
+        size = like[0].shape[2:]
+    elif None not in code.sizes(0)[2:] or param.HasField("height"):
+        size = tuple(layer.top_shapes[0][2:])
+    else:
+        size = call(zoomed_size, x, param.shrink_factor, param.zoom_factor)
+    return call(F.interpolate, x, size=size, mode="bilinear", align_corners=True)
 
 
 @exports("netspec.dialects.blocks.blocks.DeephiResize")
-class DeephiResizeExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p = self.layer.settings
-        size = graph.constant([p.new_height, p.new_width])
-        if not p.new_height:
-            floats = graph.cast(graph.shape_of(bottoms[0], 2, 4), "float32")
-            size = graph.cast(graph.node("Mul", floats, graph.constant([p.scale_h, p.scale_w])), "int64")
-        sizes = graph.node("Concat", graph.shape_of(bottoms[0], 0, 2), size, axis=0)
-        grid = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-        if self.layer.nearest:
-            grid = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-        return graph.node("Resize", bottoms[0], "", "", sizes, **grid)
-
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        layer, p = self.layer, self.layer.settings
-        mode = "nearest" if layer.nearest else "bilinear"
-        if p.new_height:
-            return call(F.interpolate, x, tuple(layer.top_shapes[0][2:]), mode=mode)
-        scales = (p.scale_h, p.scale_w)
-        return call(F.interpolate, x, scale_factor=scales, mode=mode, recompute_scale_factor=True)
+def deephi_resize(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    p, mode = layer.settings, "nearest" if layer.nearest else "bilinear"
+    if p.new_height:
+        return call(F.interpolate, x, tuple(layer.top_shapes[0][2:]), mode=mode)
+    return call(F.interpolate, x, scale_factor=(p.scale_h, p.scale_w), mode=mode, recompute_scale_factor=True)
 
 
 @exports("netspec.dialects.blocks.filters.Convolution")
-class PaddedConvolutionExport(ConvolutionExport):
-    @override
-    def onnx_geometry(self) -> dict[str, Any]:
-        geometry = super().onnx_geometry()
-        left, right, top, bottom = self.layer.sides
-        return geometry | {"pads": [top, left, bottom, right]} if any(self.layer.sides) else geometry
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        layer = self.layer
-        if any(layer.sides) and any(layer.overhang(layer.bottom_shapes[0])):
-            raise self.refusal("ONNX", "its filter is longer than the map")
-        return super().to_onnx(graph, *bottoms)
-
-    def to_torch(self, code: TorchCode, *bottoms: Expression) -> Sequence[Expression]:
-        sides = tuple(self.layer.sides)
-        padded = [call(F.pad, bottom, sides) for bottom in bottoms] if any(sides) else bottoms
-        return super().to_torch(code, *padded)
+def padded_convolution(layer: Any, code: TorchCode, *bottoms: Expression) -> Sequence[Expression]:
+    sides = tuple(layer.sides)
+    padded = [call(F.pad, bottom, sides) for bottom in bottoms] if any(sides) else bottoms
+    return convolved(layer, code, (nn.Conv1d, nn.Conv2d, nn.Conv3d), padded)
 
 
 @exports("netspec.dialects.blocks.filters.Pooling")
-class PaddedPoolingExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        layer = self.layer
-        for axis in (2, 3):
-            graph.size(0, axis, "its windows follow from the map's size")
-        left, right, up, down = layer.frame
-        if min(layer.frame) < 0:
-            raise self.refusal("ONNX", "its windows leave out the map's end")
-        value = graph.constant(windows.LOWEST if layer.method == pooling.MAX else 0.0)
-        padded = graph.node(
-            "Pad", *bottoms, graph.constant([0, 0, up, left, 0, 0, down, right]), value, mode="constant"
-        )
-        geometry = {"kernel_shape": list(layer.kernel), "strides": list(layer.stride)}
-        if layer.method == pooling.MAX:
-            return graph.node("MaxPool", padded, **geometry)
-        shares = (layer.areas() / math.prod(layer.kernel)).float()
-        return graph.node("Div", graph.node("AveragePool", padded, **geometry), graph.constant(shares[None, None]))
+def padded_pooling(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    for axis in (2, 3):
+        code.size(0, axis, "its windows follow from the map's size")
+    if layer.method == pooling.AVE:
+        return means_of_padded(code, x, layer.frame, layer.kernel, layer.stride, layer.areas())
+    padded = call(F.pad, x, tuple(layer.frame), value=-torch.inf)
+    return call(F.max_pool2d, padded, each(layer.kernel), each(layer.stride))
 
 
 @exports("netspec.dialects.blocks.filters.Dropout")
-class ScaledDropoutExport(DropoutExport):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        top = super().to_onnx(graph, *bottoms)
-        if value(self.layer.param.dropout_param, "scale_train"):
-            return top
-        return graph.node("Mul", *bottoms, graph.constant(1 - self.layer.ratio))
-
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        layer = self.layer
-        if value(layer.param.dropout_param, "scale_train"):
-            return super().to_torch(code, x)
-        if layer.phase == TRAIN:
-            raise self.refusal("PyTorch", "torch's dropout scales in training, this one in testing")
-        return x * (1 - layer.ratio)
+def scaled_dropout(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    if value(layer.param.dropout_param, "scale_train"):
+        return dropout(layer, code, x)
+    if layer.phase == TRAIN:
+        raise refusal(layer, "torch's dropout scales in training, this one in testing")
+    return x * (1 - layer.ratio)
 
 
 @exports("netspec.dialects.blocks.layout.CropCenter")
-class CropCenterExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        cuts = [part.start for part in self.layer.window]
-        axes = [axis for axis, cut in enumerate(cuts) if cut]
-        if not axes:
-            return graph.node("Identity", bottoms[0])
-        starts, ends = (graph.constant([sign * cuts[axis] for axis in axes]) for sign in (1, -1))
-        return graph.node("Slice", bottoms[0], starts, ends, graph.constant(axes))
+def crop_center(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    cuts = [part.start for part in layer.window]
+    return x[tuple(slice(cut, -cut) if cut else slice(None) for cut in cuts)]
 
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        cuts = [part.start for part in self.layer.window]
-        return x[tuple(slice(cut, -cut) if cut else slice(None) for cut in cuts)]
+
+@exports("netspec.dialects.blocks.layout.Reorg")
+def reorg(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    return call(reorganized, x, layer.stride, layer.reverse)
 
 
 @exports("netspec.dialects.blocks.normalize.Normalize")
-class NormalizeExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-        layer = self.layer
-        axes = len(layer.bottom_shapes[0])
-        over = graph.constant(list(range(1, axes)) if layer.across else [1])
-        parts = graph.node("Mul", *bottoms, *bottoms) if layer.squares else graph.node("Abs", *bottoms)
-        size = graph.node("Add", graph.node("ReduceSum", parts, over, keepdims=1), graph.constant(layer.eps))
-        size = graph.node("Sqrt", size) if layer.squares else size
-        top = graph.node("Div", *bottoms, size)
-        if layer.blobs:
-            shape = (*layer.blob_shapes[0], *(1,) * (axes - 2)) if layer.blob_shapes[0] else ()
-            top = graph.node("Mul", top, graph.blob(0, shape))
-        return top if layer.num_tops == 1 else [top, size]
-
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression | Sequence[Expression]:
-        layer = self.layer
-        axes, eps = len(layer.bottom_shapes[0]), rounded(layer.eps)
-        over = tuple(range(1, axes)) if layer.across else 1
-        if layer.blobs:
-            shape = (*layer.blob_shapes[0], *(1,) * (axes - 2)) if layer.blob_shapes[0] else ()
-            return call(normalize, x, code.parameter(0, shape), over, eps=eps)
-        size = call(length, x, over, eps, layer.squares)
-        return x / size if layer.num_tops == 1 else [x / size, size]
+def normalized(layer: Any, code: TorchCode, x: Expression) -> Expression | Sequence[Expression]:
+    axes, eps = len(layer.bottom_shapes[0]), rounded(layer.eps)
+    over = tuple(range(1, axes)) if layer.across else 1
+    if layer.blobs:
+        shape = (*layer.blob_shapes[0], *(1,) * (axes - 2)) if layer.blob_shapes[0] else ()
+        return call(normalize, x, code.parameter(0, shape), over, eps=eps)
+    size = call(length, x, over, eps, layer.squares)
+    if layer.num_tops == 1:
+        return x / size
+    lengths = with_axes(size, len(layer.top_shapes[1]) - axes)
+    return [x / size, lengths if layer.passes_length else lengths.detach()]
 
 
 @exports("netspec.dialects.blocks.nvidia.BatchNorm")
-class NvidiaBatchNormExport(BatchNormExport):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        layer = self.layer
-        top = super().to_onnx(graph, *bottoms)
-        if not layer.scales:
-            return top
-        shape = (layer.channels, *(1,) * (len(layer.bottom_shapes[0]) - 2))
-        return graph.node("Add", graph.node("Mul", top, graph.blob(SLOPES, shape)), graph.blob(BIASES, shape))
-
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        layer = self.layer
-        top = super().to_torch(code, x)
-        if layer.use_global_stats or not layer.scales:
-            return top
-        shape = (layer.channels, *(1,) * (len(layer.bottom_shapes[0]) - 2))
-        return top * code.parameter(SLOPES, shape, "slope") + code.parameter(BIASES, shape, "bias")
-
-    @override
-    def affine(self, code: TorchCode) -> dict[str, torch.Tensor]:
-        layer = self.layer
-        return {"weight": layer.blob(SLOPES), "bias": layer.blob(BIASES)} if layer.scales else super().affine(code)
+def nvidias_batch_norm(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    if not layer.scales:
+        return batch_norm(layer, code, x)
+    if layer.use_global_stats and is_module(layer):
+        affine = {"weight": layer.blob(SLOPES), "bias": layer.blob(BIASES)}
+        return by_statistics(layer, code, x, *layer.stored_statistics(), **affine)
+    shape = (layer.channels, *(1,) * (len(layer.bottom_shapes[0]) - 2))
+    return batch_norm(layer, code, x) * code.parameter(SLOPES, shape, "slope") + code.parameter(BIASES, shape, "bias")
 
 
 @exports("netspec.dialects.blocks.order.Reordered")
-class ReorderedExport(Exporter):
-    onnx_op, onnx_attributes = "Transpose", ("perm",)
-
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        return x.permute(*self.layer.perm)
+def reordered(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    return x.permute(*layer.perm)
 
 
 @exports("netspec.dialects.blocks.relu6.Capped")
-class CappedExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        if self.layer.slope == 0:
-            return graph.node("Clip", *bottoms, graph.constant(0.0), graph.constant(6.0))
-        leaky = graph.node("LeakyRelu", *bottoms, alpha=self.layer.slope)
-        return graph.node("Min", leaky, graph.constant(6.0))
+def capped(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    return call(F.relu6, x) if layer.slope == 0 else call(F.leaky_relu, x, layer.slope).clamp(max=6)
 
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        return call(F.relu6, x) if self.layer.slope == 0 else call(F.leaky_relu, x, self.layer.slope).clamp(max=6)
+
+@exports("netspec.dialects.faces.happynear.Arccos")
+def arccos(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    return call(arc_cosine, x)
+
+
+@exports("netspec.dialects.video.flownet.NegReLU")
+def neg_relu(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    return call(negative_relu, x, rounded(layer.param.relu_param.negative_slope))
+
+
+@exports("netspec.dialects.yolo.yolo.HardSigmoid")
+def hard_sigmoid(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    return call(hardened_sigmoid, x)
 
 
 def zoomed_size(x, shrink, zoom):
@@ -252,11 +145,46 @@ def zoomed_size(x, shrink, zoom):
 
 
 def normalize(x, scale, axes, eps):
-    """Divide by the length over some axes, and multiply by learnable scales."""
-    length = (x.square().sum(axes, keepdim=True) + eps).sqrt()
-    return scale * x / length
+    """Divide by the length over some axes, and multiply by learnable scales.
+
+    The gradient is the fork's, which multiplies by the scales last.
+    """
+    scaled = x.detach() + scale.detach() * (x - x.detach())
+    found = scaled / length(scaled, axes, eps, squares=True)
+    return scale * found.detach() + (found - found.detach())
 
 
 def length(x, axes, eps, squares):
     """Return the length over some axes, or the sum of absolute values."""
-    return (x.square().sum(axes, keepdim=True) + eps).sqrt() if squares else x.abs().sum(axes, keepdim=True) + eps
+    total = (x.square() if squares else x.abs()).sum(axes, keepdim=True) + eps
+    return total.sqrt() if squares else total
+
+
+def reorganized(x, stride, reverse):
+    """Return pixels as channels, as Darknet does, or with ``reverse`` channels as pixels."""
+    images, channels, height, width = x.shape
+    few = channels // stride**2
+    if reverse:
+        x = x.reshape(images, stride, stride, few, height, width)
+        x = x.permute(0, 3, 4, 1, 5, 2)
+        return x.reshape(images, few, height * stride, width * stride)
+    x = x.reshape(images, few, height, stride, width, stride).permute(0, 3, 5, 1, 2, 4)
+    return x.reshape(images, channels * stride**2, height // stride, width // stride)
+
+
+def arc_cosine(x):
+    """Return the arc cosine; above 0.99, its gradient is that at 0.99."""
+    at = x.detach()
+    slope = -(1 - at.clamp(max=0.99).square()).rsqrt()
+    return at.acos() + slope * (x - at)
+
+
+def negative_relu(x, slope):
+    """Return min(x, 0) + slope max(x, 0)."""
+    return torch.where(x < 0, x, slope * x)
+
+
+def hardened_sigmoid(x):
+    """Return 0.2 x + 0.5 between 0 and 1; its gradient is 0.2 everywhere."""
+    line = 0.2 * x + 0.5
+    return line + (line.clamp(0, 1) - line).detach()

@@ -10,7 +10,7 @@ from pathlib import Path
 from netspec.errors import SpecError, check_choice
 from netspec.graph.options import ENGINES, FP32, ONNXRUNTIME, OPENVINO, PRECISIONS, TORCH
 
-_NEEDS = {ONNXRUNTIME: ("onnx", "onnxruntime"), OPENVINO: ("onnx", "openvino")}  # modules
+_NEEDS = {ONNXRUNTIME: ("onnx", "onnxscript", "onnxruntime"), OPENVINO: ("onnx", "onnxscript", "openvino")}  # modules
 
 
 @dataclass(frozen=True)

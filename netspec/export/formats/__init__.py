@@ -1,1 +1,1 @@
-"""Export of nets as ONNX, PyTorch source, torch.export or safetensors. Each layer defines its own export."""
+"""The formats that nets are exported to."""

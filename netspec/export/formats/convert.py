@@ -17,7 +17,7 @@ from netspec.export.formats.preprocess import Preprocess
 from netspec.export.formats.torch import export_torch, write_tensors
 from netspec.files.kinds import unreadable
 from netspec.files.version import version
-from netspec.graph.filter import with_state
+from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
@@ -46,9 +46,9 @@ class Source:
         """Return the net with its weights; layers that read data are inputs. Raises SpecError."""
         message, source = parse_net(self.file)
         message = with_state(message, PHASES[self.phase], self.options.level, self.options.stages)
-        message, source = with_inputs(message, source, self.options, self.labels)
         if self.blobs:
-            message, source = prune(message, source, self.blobs, {})
+            message, source = prune(*filter_net(message, source), self.blobs, {})
+        message, source = with_inputs(message, source, self.options, self.labels)
         net = build_net(message, source, replace(self.options, seed=0))
         if self.weights:
             load_weights(net, self.weights)
@@ -99,7 +99,7 @@ def blob_tensors(net: Net) -> dict[str, torch.Tensor]:
     for layer in net.layers:
         for j, blob in enumerate(layer.blobs):
             if id(blob) not in seen:
-                found[f"{layer.param.name}.{j}"] = layer.blob(j).detach().cpu().contiguous()
+                found[f"{layer.param.name}.{j}"] = layer.blob(j)
             seen.add(id(blob))
     return found
 

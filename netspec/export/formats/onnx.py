@@ -1,4 +1,4 @@
-"""``--to onnx``: writes a net as an ONNX model, layer by layer.
+"""``--to onnx``: writes a net as an ONNX model, which torch.onnx makes from the exported PyTorch module.
 
 Caffe: the model corresponds to Net::Reshape for the sizes at run time
 """
@@ -6,38 +6,37 @@ Caffe: the model corresponds to Net::Reshape for the sizes at run time
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+import logging
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from netspec.errors import SpecError
-from netspec.export.exporter import exported, layer_notes, refusal
+from netspec.export.exporter import layer_notes, refusal
+from netspec.export.expression import TRAINING, Call, Submodule, evaluate, parts
+from netspec.export.formats.nodes import translations
 from netspec.export.formats.preprocess import Preprocess
-from netspec.export.formats.shapes import LayerShapes, NetShapes, is_given, settled
+from netspec.export.formats.shapes import NetShapes, settled
+from netspec.export.formats.source import unique
+from netspec.export.formats.torch_code import Definition, write_definition
 from netspec.files.whole_file import whole_file, write_whole
-from netspec.layers.contract.base import Layer
-from netspec.layers.contract.learned import values_of
+from netspec.graph.options import OPSET
 from netspec.net.net import Net
 
-OPSET, IR_VERSION = 17, 8  # ONNX 1.12 (2022); older readers know it, and onnx2torch nothing newer
+IR_VERSION = 8  # of ONNX 1.13
 LARGEST = 2**31 - 2**24  # bytes of weights: protobuf's limit, with room for the graph
-LARGE, PAGE = (
-    1024,
-    4096,
-)  # bytes: smaller weights stay in the model; others are aligned to pages, for memory mapping
-DTYPES = {np.dtype(np.float32): 1, np.dtype(np.uint8): 2, np.dtype(np.int64): 7, np.dtype(bool): 9}  # TensorProto's
-CAST_TO = {"float32": 1, "int64": 7, "bool": 9}
-
-
-def _onnx() -> Any:
-    try:
-        import onnx
-    except ImportError:
-        raise SpecError("--to onnx needs the onnx library: pip install 'netspec-caffe[onnx]'") from None
-    return onnx
+LARGE = 1024  # bytes: smaller weights stay in the model
 
 
 def export_onnx(
@@ -50,281 +49,283 @@ def export_onnx(
 ) -> list[str]:
     """Write a net with its current weights as an ONNX model; return notes for the user, as lines.
 
-    ``blobs`` that are neither inputs nor outputs become additional outputs.
-    Weights of more than ``largest`` bytes are in a file next to it: ``path`` with ``.data`` appended.
-    Raises SpecError if a layer cannot be exported or the file cannot be written.
+    ``blobs`` that are neither inputs nor outputs become additional outputs. Weights of more than ``largest`` bytes are
+    in a file next to the model: ``path`` with ``.data`` appended. Raises SpecError if a layer cannot be exported or the
+    file cannot be written.
     """
-    _onnx()
-    writer, shapes = settled(net, lambda shapes: _Writer(net, shapes, preprocess, blobs))
-    notes = [*shapes.fixed, *layer_notes(net.layers)]
-    path = Path(path)
-    if sum(array.nbytes for array in writer.initializers.values()) <= largest:
-        write_whole(path, writer.model(metadata or {}).SerializeToString())
+    for library in ("onnx", "onnxscript"):
+        if find_spec(library) is None:
+            raise SpecError(f"--to onnx needs the {library} library: pip install 'netspec-caffe[onnx]'")
+    import onnx_ir as ir
+
+    definition, shapes = onnx_definition(net)
+    writer = _Writer(net, definition, shapes, preprocess, blobs)
+    model = writer.model(dict(metadata or {}))
+    notes, path = [*writer.shapes.fixed, *layer_notes(net.layers)], Path(path)
+    if sum(value.const_value.nbytes for value in model.graph.initializers.values()) <= largest:
+        write_whole(path, ir.to_proto(model).SerializeToString())
         return notes
     data = path.with_name(f"{path.name}.data")
-    with whole_file(path) as unfinished, whole_file(data) as unfinished_data:
-        with unfinished_data.open("wb") as file:
-            model = writer.model(metadata or {}, _DataFile(file, data.name))
-        unfinished.write_bytes(model.SerializeToString())
+    with whole_file(path) as unfinished, whole_file(data) as written:
+        ir.external_data.unload_from_model(model, written.parent, written.name, size_threshold_bytes=LARGE)
+        proto = ir.to_proto(model)
+        for place in (each for tensor in proto.graph.initializer for each in tensor.external_data):
+            place.value = data.name if place.key == "location" else place.value
+        unfinished.write_bytes(proto.SerializeToString())
     return [*notes, f"the weights are in {data.name}, next to the model"]
 
 
-def _write_layer(layer: Layer, graph: OnnxGraph, *bottoms: str) -> str | Sequence[str]:
-    """Write a layer into the graph; return the values of its tops. Raises SpecError if it cannot be exported."""
-    if is_given(layer):
-        return [graph.input(i) for i in range(layer.num_tops)]
-    write, op = exported(layer, "to_onnx"), exported(layer, "onnx_op")
-    if write is not None:
-        return write(graph, *bottoms)
-    if op is None:
-        raise refusal(layer, "ONNX")
-    attributes = exported(layer, "onnx_attributes") or ()
-    return graph.node(op, *bottoms, **{name: getattr(layer, name) for name in attributes})
-
-
-class _DataFile:
-    """The file with the large weights of a model. The model refers to it by ``name``."""
-
-    def __init__(self, file: BinaryIO, name: str) -> None:
-        self.file, self.name = file, name
-
-    def write(self, array: np.ndarray) -> dict[str, str]:
-        """Append an array; return its location in ONNX's format."""
-        self.file.seek(-(-self.file.tell() // PAGE) * PAGE)
-        found = {"location": self.name, "offset": str(self.file.tell()), "length": str(array.nbytes)}
-        self.file.write(array.data)
-        return found
+def onnx_definition(net: Net) -> tuple[Definition, NetShapes]:
+    """Return the module from which the model of a net is made, and its shapes. Raises SpecError."""
+    definition, shapes = settled(net, lambda shapes: write_definition(net, shapes, onnx=True))
+    for targets, expression in definition.statements:
+        if any(part is TRAINING for part in parts(expression)):
+            layer = next(
+                layer for layer, node in zip(net.layers, net.plan.nodes, strict=True) if targets[0] in node.tops
+            )
+            raise refusal(layer, "it draws random numbers in the training phase; --to torch has it")
+    return definition, shapes
 
 
 class _Writer:
-    """Writes the graph of a net."""
+    """Makes the model of a net: torch.onnx traces its definition, whose values then get the names of their blobs."""
 
-    def __init__(self, net: Net, shapes: NetShapes, preprocess: Preprocess | None, blobs: Collection[str]) -> None:
-        more = {blob: v for v, blob in enumerate(net.plan.blobs) if blob in blobs}
+    def __init__(
+        self,
+        net: Net,
+        definition: Definition,
+        shapes: NetShapes,
+        preprocess: Preprocess | None,
+        blobs: Collection[str],
+    ) -> None:
+        self.net, self.definition, self.shapes, self.preprocess = net, definition, shapes, preprocess
+        self.given = {net.plan.blobs[v]: v for v in definition.inputs}
+        self.layer_of = {v: node.name for node in net.plan.nodes for v in node.tops}
+        self.last = {blob: v for v, blob in enumerate(net.plan.blobs)}
+        self.described: dict[str, str] = {}  # what the names of values that need another name stand for
+        self.names = {v: self._name(v) for targets, _ in definition.statements for v in targets}
+        more = {blob: self.last[blob] for blob in blobs if self.given.get(blob) != self.last[blob]}
         self.outputs = {**net.plan.outputs, **more}
-        self.net, self.shapes, self.preprocess = net, shapes, preprocess
-        self.nodes: list[Any] = []
-        self.initializers: dict[str, np.ndarray] = {}
-        self.inputs: list[Any] = []
-        self.names: set[str] = set(net.plan.blobs)
-        self.values: dict[int, str] = {}  # value number -> name
-        self._constants: dict[bytes, str] = {}
-        self._blobs: dict[tuple[int, tuple[int, ...]], str] = {}  # by address and shape
-        for i, (node, layer) in enumerate(zip(net.plan.nodes, net.layers, strict=True)):
-            tops = _write_layer(layer, OnnxGraph(self, i), *(self.values[v] for v in node.bottoms))
-            named = (tops,) if isinstance(tops, str) else tops
-            self.values.update(zip(node.tops, named, strict=False))
 
-    # Called by layers
-
-    def unique(self, name: str) -> str:
-        """Return a new name that starts with this one."""
-        found, k = name, 1
-        while found in self.names:
-            found, k = f"{name}_{k}", k + 1
-        self.names.add(found)
-        return found
-
-    def add(self, op: str, inputs: Sequence[str], outputs: int, name: str, attributes: Mapping[str, Any]) -> list[str]:
-        """Add a node; return its outputs."""
-        made = [self.unique(f"{name}/{op}") for _ in range(outputs)]
-        self.nodes.append(_onnx().helper.make_node(op, list(inputs), made, name=made[0], **attributes))
-        return made
-
-    def store(self, values: np.ndarray, name: str) -> str:
-        """Add an initializer; return its name. Equal small ones are stored once."""
-        key = f"{values.dtype} {values.shape} ".encode() + values.tobytes() if values.size <= 64 else b""
-        if key and key in self._constants:
-            return self._constants[key]
-        unique = self.unique(name)
-        self.initializers[unique] = values
-        if key:
-            self._constants[key] = unique
-        return unique
-
-    def store_blob(self, blob: torch.Tensor, shape: tuple[int, ...], name: str) -> str:
-        """Add a learnable blob, once for all layers that share it; return its name."""
-        key = (blob.data_ptr(), shape)
-        if key not in self._blobs:
-            self._blobs[key] = self.store(values_of(blob).cpu().float().reshape(shape).numpy(), name)
-        return self._blobs[key]
-
-    def add_input(self, value: int, blob: str) -> str:
-        """Add an input of the net, with the preprocessing of images; return the value that the net reads."""
-        sizes = self.symbols(value)
-        if self.preprocess is None or self.preprocess.blob != blob:
-            self.inputs.append(_value_info(blob, np.float32, sizes))
+    def _name(self, v: int) -> str:
+        """Return the name of a value: its blob, if it is the last value of the blob, or BLOB_of_LAYER."""
+        blob = self.net.plan.blobs[v]
+        if self.definition.passed[self.last[blob]] == v and blob not in self.given:
             return blob
-        shape = self.shapes.sizes(value)
-        dtype, image, read = self.preprocess.to_onnx(_Steps(self, blob), blob, shape)
-        self.inputs.append(_value_info(blob, dtype, [s if i is None else i for s, i in zip(sizes, image, strict=True)]))
-        return read
+        layer = self.layer_of[v]
+        name = unique(f"{blob}_of_{layer}", {*self.last, *self.described})
+        self.described[name] = f'blob "{blob}" after layer "{layer}"'
+        return name
 
-    def symbols(self, value: int) -> list[int | str]:
-        """Return the shape of a value for ONNX: numbers, and names for dynamic sizes."""
-        sizes: list[int | str] = []
-        for axis, size in enumerate(self.shapes.sizes(value)):
-            name = self.shapes.name(value, axis) if size is None else ""
-            sizes.append(f"{self.net.plan.blobs[value]}_{axis}" if name == "?" else name if size is None else size)
-        return sizes
-
-    # The model
-
-    def model(self, metadata: Mapping[str, str], data_file: _DataFile | None = None) -> Any:
-        """Return the model. Its large weights are written to ``data_file``, if there is one."""
-        onnx, net = _onnx(), self.net
-        renamed = self._name_values()
-        taken = {given.name for given in self.inputs}
-        outputs = [
-            _value_info(name, np.float32, self.symbols(v)) for name, v in self.outputs.items() if name not in taken
-        ]
-        used = {name for node in self.nodes for name in node.input}
-        stored = [_tensor(name, array, data_file) for name, array in self.initializers.items() if name in used]
-        graph = onnx.helper.make_graph(self.nodes, net.name or "net", self.inputs, outputs, stored)
-        model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)])
-        model.ir_version = IR_VERSION
-        model.producer_name = "netspec"
-        described = {**metadata, **({"blobs": json.dumps(renamed)} if renamed else {})}
-        if self.shapes.fixed:
-            file = net.plan.source.file  # the folder is private
-            described["fixed"] = "\n".join(self.shapes.fixed).replace(file, Path(file).name)
+    def model(self, metadata: dict[str, str]) -> Any:
+        """Return the model, of onnx_ir, without its weights in the form of a file."""
+        steps = None
         if self.preprocess:
-            described["input"] = self.preprocess.description
-        onnx.helper.set_model_props(model, {f"netspec.{key}": text for key, text in described.items()})
+            shape = self.shapes.sizes(self.given[self.preprocess.blob])
+            self.preprocess.check(shape)
+            steps = self.preprocess.blob, partial(self.preprocess.applied, shape)
+        module = _Traced(self.definition, [*self._copied.values()], steps).eval()
+        examples, free = self._examples()
+        sizes = (tuple(free),) if free else None
+        with _signals_kept(), _quiet(), torch.no_grad():
+            traced = torch.export.export(module, (tuple(examples),), dynamic_shapes=sizes, strict=False)
+            options = {"opset_version": OPSET, "custom_translation_table": translations()}
+            program = torch.onnx.export(traced, dynamo=True, optimize=False, verbose=False, **options)
+            self._set_ends(program.model.graph)
+            program.optimize()
+        model = program.model
+        model.graph.outputs.extend(x for x in model.graph.inputs if x.name in self.outputs.keys() & self.given.keys())
+        _pad_pixels(model.graph)
+        self._name_all(model.graph)
+        if self.described:
+            metadata["blobs"] = json.dumps(self.described)
+        if self.shapes.fixed:
+            file = self.net.plan.source.file  # the folder is private
+            metadata["fixed"] = "\n".join(self.shapes.fixed).replace(file, Path(file).name)
+        if self.preprocess:
+            metadata["input"] = self.preprocess.description
+        model.ir_version, model.producer_name, model.producer_version = IR_VERSION, "netspec", ""
+        model.metadata_props.clear()
+        model.metadata_props.update({f"netspec.{key}": text for key, text in metadata.items()})
         return model
 
-    def _name_values(self) -> dict[str, str]:
-        """Name the values after their blobs. Return name -> description for those that need another name.
+    @cached_property
+    def _copied(self) -> dict[str, int]:
+        """The outputs that are copies: those that are inputs or parameters, or other names of a value."""
+        calls = {v for targets, it in self.definition.statements if isinstance(it, Call) for v in targets}
+        ends = {name: v for name, v in self.outputs.items() if self.given.get(name) != v}
+        sources = {name: self.definition.passed[v] for name, v in ends.items()}
+        return {name: v for name, v in sources.items() if v not in calls or self._output_name(name) != self.names[v]}
 
-        If layers change a blob in place, its last value gets the name of the blob.
-        """
-        plan = self.net.plan
-        layer_of = {v: node.name for node in plan.nodes for v in node.tops}
-        passed_on = {
-            v for node in plan.nodes for v in node.tops if self.values[v] in map(self.values.get, node.bottoms)
-        }
-        inputs = {info.name for info in self.inputs}
-        new_names: dict[str, str] = {}
-        descriptions: dict[str, str] = {}
-        taken = set(inputs)
-        for v in reversed(range(len(plan.blobs))):
-            old, blob = self.values[v], plan.blobs[v]
-            is_output = self.outputs.get(blob) == v and blob not in inputs
-            if is_output and (v in passed_on or old in new_names or old in inputs or old in self.initializers):
-                passed_on.discard(v)
-                old = self.values[v] = self.add("Identity", [old], 1, layer_of[v], {})[0]
-            if v in passed_on or old in new_names or old in inputs or old in self.initializers:
+    def _output_name(self, blob: str) -> str:
+        return self.names.get(self.last[blob], blob) if blob in self.given else blob
+
+    def _sizes(self, v: int) -> list[int | str]:
+        """Return the shape of a value: numbers, and names for dynamic sizes."""
+        names = [self.shapes.name(v, axis) for axis in range(len(self.shapes.built[v]))]
+        unknown = f"{self.net.plan.blobs[v]}_"
+        sizes = zip(self.shapes.sizes(v), names, strict=True)
+        return [
+            size if size is not None else f"{unknown}{axis}" if name == "?" else name
+            for axis, (size, name) in enumerate(sizes)
+        ]
+
+    def _examples(self) -> tuple[list[torch.Tensor], list[dict[int, Any]]]:
+        """Return an input of each size that is traced, and its dynamic axes. Torch takes a size of 1 for a constant."""
+        examples, every = [], []
+        for v in self.definition.inputs:
+            sizes, free, dtype = list(self.shapes.built[v]), {}, torch.float32
+            for each in self.shapes.free:
+                for axis in (axis for value, axis in each.axes if value == v and not each.counted):
+                    free[axis] = torch.export.Dim.AUTO
+                    sizes[axis] = sizes[axis] if sizes[axis] > 1 else each.tried[0][v][axis]
+            if self.preprocess and self.preprocess.blob == self.net.plan.blobs[v]:
+                dtype = torch.uint8 if self.preprocess.uint8 else dtype
+                for axis in (2, 3) if self.preprocess.crop else ():
+                    free[axis], sizes[axis] = torch.export.Dim.AUTO, sizes[axis] + 2
+            examples.append(torch.zeros(sizes, dtype=dtype))
+            every.append(free)
+        return examples, every
+
+    def _set_ends(self, graph: Any) -> None:
+        """Name the inputs, the outputs and the values of blobs, and describe their sizes."""
+        import onnx_ir as ir
+
+        for value, v in zip(graph.inputs, self.definition.inputs, strict=True):
+            found = value.shape
+            for each in self.shapes.free:
+                for axis in (axis for own, axis in each.axes if own == v and not each.counted):
+                    if isinstance(found[axis], int):
+                        self.shapes = self.shapes.without(each, "torch.export takes it for a constant")
+            sizes = self._sizes(v)
+            if self.preprocess and self.preprocess.crop and self.preprocess.blob == self.net.plan.blobs[v]:
+                sizes[2:] = ["image_H", "image_W"]
+            value.name, value.shape = self.net.plan.blobs[v], ir.Shape(sizes)
+        made = [*self.names.values(), *map(self._output_name, self._copied)]
+        by_name = dict(zip(made, graph.outputs, strict=True))
+        for k, value in enumerate(value for node in graph for value in node.outputs):
+            value.name = f"value/{k}"
+        for name, value in by_name.items():
+            value.name = name
+        taken = {*self.last, *self.described, *graph.initializers}
+        for value in [graph.initializers[name] for name in graph.initializers if name in self.last]:
+            value.name = unique(value.name, taken)
+        graph.outputs.clear()
+        for blob, v in self.outputs.items():
+            if self.given.get(blob) == v:
                 continue
-            name = blob
-            if blob in taken:
-                name = self.unique(f"{blob}_of_{layer_of[v]}")
-                descriptions[name] = f'blob "{blob}" after layer "{layer_of[v]}"'
-            taken.add(name)
-            new_names[old] = name
-        for node in self.nodes:
-            node.input[:] = [new_names.get(name, name) for name in node.input]
-            node.output[:] = [new_names.get(name, name) for name in node.output]
-        return descriptions
+            value = by_name[self._output_name(blob)]
+            value.shape = ir.Shape(self._sizes(v))
+            graph.outputs.append(value)
+
+    def _name_all(self, graph: Any) -> None:
+        """Name nodes after what they compute, and remove what torch wrote of files and sizes."""
+        import onnx_ir as ir
+
+        ends = {id(value) for value in (*graph.inputs, *graph.outputs)}
+        taken = {*self.last, *self.described}
+        graph.name, graph.doc_string = self.net.name or "net", None
+        graph.metadata_props.clear()
+        for value in (*graph.inputs, *graph.initializers.values()):
+            value.metadata_props.clear()
+        pending: list[Any] = []
+        for node in graph:
+            node.metadata_props.clear()
+            node.doc_string = None
+            if node.op_type == "ConstantOfShape" and "value" not in node.attributes:  # OpenCV 5 has no default
+                node.attributes["value"] = ir.AttrTensor("value", ir.tensor(np.zeros(1, np.float32)))
+            pending.append(node)
+            named = next((value.name for value in node.outputs if value.name in taken), "")
+            for each in pending if named else ():
+                each.name = unique(f"{named}/{each.op_type}", taken)
+            pending = [] if named else pending
+            for value in node.outputs:
+                value.metadata_props.clear()
+                if id(value) not in ends:
+                    value.shape = None
 
 
-def _tensor(name: str, array: np.ndarray, data_file: _DataFile | None) -> Any:
-    onnx = _onnx()
-    tensor = onnx.TensorProto(name=name, dims=array.shape, data_type=DTYPES[array.dtype])
-    array = np.ascontiguousarray(array)
-    if data_file is None or array.nbytes < LARGE:
-        tensor.raw_data = array.tobytes()
-        return tensor
-    tensor.data_location = onnx.TensorProto.EXTERNAL
-    for key, value in data_file.write(array).items():
-        tensor.external_data.add(key=key, value=value)
-    return tensor
+def _pad_pixels(graph: Any) -> None:
+    """Pad the maps for filters of one pixel in a node of its own, because OpenCV 5 pads them wrong."""
+    import onnx_ir as ir
+
+    for node in graph:
+        pads = node.attributes.get_ints("pads", ())
+        if node.op_type != "Conv" or not any(pads) or set(node.attributes.get_ints("kernel_shape", (0,))) != {1}:
+            continue
+        half = len(pads) // 2
+        frame = ir.node("Constant", [], {"value_ints": [0, 0, *pads[:half], 0, 0, *pads[half:]]})
+        padded = ir.node("Pad", [node.inputs[0], frame.outputs[0]])
+        graph.insert_before(node, [frame, padded])
+        node.replace_input_with(0, padded.outputs[0])
+        node.attributes["pads"] = ir.AttrInt64s("pads", [0] * len(pads))
 
 
-def _value_info(name: str, dtype: Any, sizes: Sequence[int | str]) -> Any:
-    return _onnx().helper.make_tensor_value_info(name, DTYPES[np.dtype(dtype)], list(sizes))
+class _Traced(nn.Module):
+    """The module that torch traces. Its outputs are all values of the definition, and copies of some.
 
-
-class _Steps:
-    """Nodes and constants: the part of :class:`OnnxGraph` that needs no layer."""
-
-    def __init__(self, writer: _Writer, name: str) -> None:
-        self.writer, self.name = writer, name
-
-    def node(self, op: str, *inputs: str, **attributes: Any) -> str:
-        """Add a node of one output and return the output. An empty input is one that is left out."""
-        return self.writer.add(op, inputs, 1, self.name, attributes)[0]
-
-    def nodes(self, op: str, *inputs: str, outputs: int, **attributes: Any) -> tuple[str, ...]:
-        """Add a node of several outputs and return them."""
-        return tuple(self.writer.add(op, inputs, outputs, self.name, attributes))
-
-    def constant(self, values: Any) -> str:
-        """Return a constant: numbers, lists or arrays. Whole numbers become int64, other numbers float32."""
-        array = values_of(values).cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
-        if array.dtype != bool:
-            array = array.astype(np.int64 if array.dtype.kind in "iu" else np.float32)
-        return self.writer.store(array, f"{self.name}/constant")
-
-    def shape_of(self, value: str, start: int = 0, end: int | None = None) -> str:
-        """Return the sizes of the axes from ``start`` to ``end`` of a value, as they are when the net runs."""
-        return self.node("Shape", value, start=start, **({} if end is None else {"end": end}))
-
-    def reshape(self, value: str, sizes: Sequence[int]) -> str:
-        """Return the value in another shape; 0 copies the size of the same axis, one -1 is inferred."""
-        return self.node("Reshape", value, self.constant(list(sizes)))
-
-    def cast(self, value: str, dtype: str) -> str:
-        """Return the value as ``float32``, ``int64`` or ``bool``."""
-        return self.node("Cast", value, to=CAST_TO[dtype])
-
-
-class OnnxGraph(_Steps, LayerShapes):
-    """The ONNX graph that is being written, as one layer sees it. Values are known by name.
-
-    Bottoms and tops are known by their index in the layer. Sizes that the caller of the exported net may choose are
-    None; a layer that needs such a size as a number asks for it with :meth:`size`, which fixes it.
+    ``steps`` are the name of a blob and a function that prepares it.
     """
 
-    def __init__(self, writer: _Writer, index: int) -> None:
-        self.layer: Layer = writer.net.layers[index]
-        self.plan_node = writer.net.plan.nodes[index]
-        self.shapes = writer.shapes
-        super().__init__(writer, self.plan_node.name)
+    def __init__(self, definition: Definition, copied: Sequence[int], steps: tuple[str, Any] | None) -> None:
+        super().__init__()
+        self.definition, self.copied, self.steps = definition, copied, steps
+        with torch.device("meta"):
+            for stored, name in definition.attributes.items():
+                if isinstance(stored, Submodule):
+                    setattr(self, name, stored.cls(*stored.args, **stored.options))
+                else:
+                    self.register_buffer(name, torch.zeros(stored.values.shape))
+        # Copies, because torch keeps tensors that it has traced.
+        self.load_state_dict({name: tensor.clone() for name, tensor in definition.state().items()}, assign=True)
 
-    def blob(self, index: int, shape: Sequence[int] | None = None) -> str:
-        """Return a learned blob of the layer, in its own shape or in another of as many elements."""
-        wanted = self.layer.blob_shapes[index] if shape is None else tuple(shape)
-        return self.writer.store_blob(self.layer.blob(index), wanted, f"{self.name}.{index}")
+    def forward(self, inputs: Sequence[torch.Tensor]) -> Any:
+        definition = self.definition
+        known: dict[Any, Any] = {each: getattr(self, name) for each, name in definition.attributes.items()}
+        known[TRAINING] = False
+        for v, x in zip(definition.inputs, inputs, strict=True):
+            known[definition.values[v]] = self.steps[1](x) if self.steps and definition.blobs[v] == self.steps[0] else x
+        values: list[Any] = []
+        for targets, expression in definition.statements:
+            made = evaluate(expression, known)
+            made = made if len(targets) > 1 else (made,)
+            known.update((definition.values[v], x) for v, x in zip(targets, made, strict=True))
+            values.extend(made)
+        return (*values, *(known[definition.values[v]].clone() for v in self.copied))
 
-    def input(self, top: int) -> str:
-        """Return a new input of the whole net, for a top that its caller gives."""
-        value = self.plan_node.tops[top]
-        return self.writer.add_input(value, self.writer.net.plan.blobs[value])
 
-    def reshape_to_top(self, value: str, top: int = 0) -> str:
-        """Return the value in the shape of a top of the layer, whatever the free sizes are."""
-        number = self.plan_node.tops[top] if top < len(self.plan_node.tops) else -1
-        sizes = list(self.layer.top_shapes[top]) if number < 0 else list(self.shapes.sizes(number))
-        free = [axis for axis, size in enumerate(sizes) if size is None]
-        if len(free) <= 1:
-            return self.reshape(value, [-1 if size is None else size for size in sizes])
-        parts = []
-        inferred = False
-        for axis, size in enumerate(sizes):
-            if size is not None:
-                parts.append(self.constant([size]))
-                continue
-            found = self._like(number, axis)
-            if found is None and inferred:
-                raise self.fixed(number, axis, "more than one size of its shape is unknown")
-            inferred = inferred or found is None
-            parts.append(found or self.constant([-1]))
-        return self.node("Reshape", value, self.node("Concat", *parts, axis=0))
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Log and warn nothing of what torch says about its own steps."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
 
-    def _like(self, value: int, axis: int) -> str | None:
-        """Return the size of an axis of a bottom that always equals this size, if there is one."""
-        for bottom in self.plan_node.bottoms:
-            for k in range(len(self.shapes.built[bottom])):
-                if self.shapes.same((bottom, k), (value, axis)):
-                    return self.shape_of(self.writer.values[bottom], k, k + 1)
-        return None
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Keep Ctrl-C and SIGTERM until the block ends: an exception in a C++ destructor of torch aborts the process.
+
+    A second signal ends the process at once.
+    """
+    kept: list[int] = []
+
+    def keep(number: int, _: object) -> None:
+        if kept:
+            os._exit(128 + number)
+        kept.append(number)
+
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, keep) for number in (signal.SIGINT, signal.SIGTERM) if main}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in kept:
+            signal.raise_signal(number)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from netspec.data.mean import center
+from netspec.data.preprocess import preprocessed
 from netspec.errors import SpecError
 
 if TYPE_CHECKING:
@@ -71,30 +72,20 @@ class Preprocess:
             f"or an image of the size of {self.blob}, {shape[1:]}"
         )
 
-    def to_onnx(self, graph: Any, value: str, shape: Sizes) -> tuple[Any, list[int | str | None], str]:
-        """Write the steps for an input of this shape; return its dtype, its sizes (None: the net's) and the result."""
+    def check(self, shape: Sizes) -> None:
+        """Raise SpecError if the steps do not fit an input of this shape."""
         if len(shape) != 4:
             raise SpecError(f"{self.blob} has shape {shape}, expected images (N, C, H, W)")
-        if self.uint8:
-            value = graph.cast(value, "float32")
-        sizes: list[int | str | None] = [None] * 4
-        if self.crop:
-            value = self._crop(graph, value, shape)
-            sizes[2:] = ["image_H", "image_W"]
-        if self.swap:
-            value = graph.node("Gather", value, graph.constant(list(range(shape[1] or 0))[::-1]), axis=1)
-        if self.raw_scale != 1:
-            value = graph.node("Mul", value, graph.constant(float(self.raw_scale)))
-        mean = self.mean_for(shape)
-        if mean is not None:
-            value = graph.node("Sub", value, graph.constant(mean))
-        if self.scale != 1:
-            value = graph.node("Mul", value, graph.constant(float(self.scale)))
-        return np.uint8 if self.uint8 else np.float32, sizes, value
-
-    def _crop(self, graph: Any, value: str, shape: Sizes) -> str:
-        if shape[2] is None or shape[3] is None:
+        self.mean_for(shape)
+        if self.crop and None in shape[2:]:
             raise SpecError(f"--crop: the height and width of {self.blob} are dynamic, so there is no size to crop to")
-        size = graph.constant([shape[2], shape[3]])
-        start = graph.node("Div", graph.node("Sub", graph.shape_of(value, 2, 4), size), graph.constant([2, 2]))
-        return graph.node("Slice", value, start, graph.node("Add", start, size), graph.constant([2, 3]))
+
+    def applied(self, shape: Sizes, images: Any) -> Any:
+        """Return images, a tensor, after the steps for an input of this shape."""
+        images = images.float() if self.uint8 else images.clone()  # the steps change it
+        for axis, size in ((2, shape[2]), (3, shape[3])) if self.crop else ():
+            images = images.narrow(axis, (images.shape[axis] - size) // 2, size)
+        images = images.flip(1) if self.swap else images
+        mean = self.mean_for(shape)
+        given = images.new_tensor(mean) if mean is not None else None
+        return preprocessed(images, None, self.raw_scale, given, self.scale)

@@ -114,6 +114,7 @@ def copied(functions: Iterable[Any]) -> dict[str, Callable[..., Any]]:
     for function in functions:
         if inspect.isfunction(function) and function.__module__.startswith("netspec."):
             called = [function.__globals__.get(name) for name in function.__code__.co_names]
+            called += function.__defaults__ or ()
             found.update(copied(each for each in called if each is not function))
             found[function.__name__] = function
     return found

@@ -12,6 +12,7 @@ import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -35,6 +36,7 @@ from netspec.export.formats.source import (
 )
 from netspec.export.formats.torch_code import Definition, write_definition
 from netspec.files.whole_file import whole_file
+from netspec.layers.contract.learned import values_of
 from netspec.net.net import Net
 
 
@@ -55,22 +57,21 @@ def export_torch(net: Net, path: str | Path, origin: str = "a prototxt") -> list
 
 
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mapping[str, str]) -> None:
-    """Write tensors as a .safetensors file, with the same bytes each time.
+    """Write float32 tensors as a .safetensors file, one by one, so that their memory is not needed twice.
 
-    The library writes metadata in the order of a hash table, which differs from process to process.
+    The file has the length of its header, the header as JSON, and the numbers.
     """
-    from safetensors.torch import save
-
-    data = memoryview(save(dict(state), dict(metadata)))
-    end = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(bytes(data[8:end]))
-    if "__metadata__" in header:
-        header = {"__metadata__": dict(sorted(header.pop("__metadata__").items())), **header}
+    header: dict[str, Any] = {"__metadata__": dict(sorted(metadata.items()))}
+    end = 0
+    for name, tensor in sorted(state.items()):
+        begin, end = end, end + 4 * tensor.numel()
+        header[name] = {"dtype": "F32", "shape": list(tensor.shape), "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)  # tensors begin at a multiple of 8
     with whole_file(path) as unfinished, unfinished.open("wb") as file:
-        for part in (len(text).to_bytes(8, "little"), text, data[end:]):
-            file.write(part)
+        file.write(len(text).to_bytes(8, "little") + text)
+        for _, tensor in sorted(state.items()):
+            file.write(values_of(tensor).cpu().float().reshape(-1).numpy())
 
 
 def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, torch.Tensor], list[str]]:

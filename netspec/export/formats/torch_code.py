@@ -9,12 +9,13 @@ from typing import Any
 
 import torch
 
-from netspec.export.exporter import exported, refusal
+from netspec.export.exporter import exporter_of
 from netspec.export.expression import Expression, Stored, Submodule, Value, parts
 from netspec.export.formats.shapes import LayerShapes, NetShapes, is_given
 from netspec.export.formats.source import legal, unique
 from netspec.graph.plan import origins
 from netspec.layers.contract.base import Layer
+from netspec.layers.contract.learned import values_of
 from netspec.net.net import Net
 
 
@@ -27,6 +28,7 @@ class Definition:
     statements: list[tuple[tuple[int, ...], Expression]] = field(default_factory=list)
     inputs: list[int] = field(default_factory=list)
     outputs: dict[str, int] = field(default_factory=dict)
+    passed: list[int] = field(default_factory=list)  # for each value, the one that it is; a layer may pass a value on
 
     @cached_property
     def attributes(self) -> dict[Stored | Submodule, str]:
@@ -37,37 +39,36 @@ class Definition:
         return {each: unique(legal(each.layer), taken) for each in stored}
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Return the state_dict of the module, with tensors of its own."""
+        """Return the state_dict of the module. Its tensors may share the net's memory."""
         tensors = {k: v for stored, name in self.attributes.items() for k, v in stored.tensors(name).items()}
-        return {name: tensor.detach().cpu().float().contiguous().clone() for name, tensor in tensors.items()}
+        return {name: values_of(tensor).cpu().float().contiguous() for name, tensor in tensors.items()}
 
 
-def write_definition(net: Net, shapes: NetShapes) -> Definition:
-    """Return the definition of a net. Raises SpecError if a layer cannot be exported."""
-    code = TorchCode(net, shapes)
+def write_definition(net: Net, shapes: NetShapes, onnx: bool = False) -> Definition:
+    """Return the definition of a net, or with ``onnx`` the one from which its ONNX model is made.
+
+    Raises SpecError if a layer cannot be exported.
+    """
+    code = TorchCode(net, shapes, onnx)
     for layer, node in zip(net.layers, net.plan.nodes, strict=True):
         code.layer, code.plan_node = layer, node
         bottoms = tuple(code.values[v] for v in node.bottoms)
-        tops = bottoms[:1] if layer in code.absorbed else _write_layer(layer, code, bottoms)
-        code.add(node.tops, tops)
+        if layer in code.absorbed:
+            code.add(node.tops, bottoms[:1])
+        elif is_given(layer):
+            code.add(node.tops, [code.input(i) for i in range(layer.num_tops)])
+        else:
+            code.add(node.tops, exporter_of(layer)(code, *bottoms))
+    code.definition.passed = [value.number for value in code.values]
     code.definition.outputs = {name: code.values[v].number for name, v in net.plan.outputs.items()}
     return code.definition
-
-
-def _write_layer(layer: Layer, code: TorchCode, bottoms: tuple[Value, ...]) -> Expression | Sequence[Expression]:
-    """Return the expressions of a layer's tops. Raises SpecError if it cannot be exported."""
-    if is_given(layer):
-        return [code.input(i) for i in range(layer.num_tops)]
-    write, plain = exported(layer, "to_torch"), exported(layer, "torch_call")
-    if write is None and plain is None:
-        raise refusal(layer, "PyTorch")
-    return write(code, *bottoms) if write is not None else plain.of(layer, bottoms)
 
 
 class TorchCode(LayerShapes):
     """The PyTorch module that is being written, as the layer sees it that is written now."""
 
-    def __init__(self, net: Net, shapes: NetShapes) -> None:
+    def __init__(self, net: Net, shapes: NetShapes, onnx: bool = False) -> None:
+        self.onnx = onnx
         self.net, self.shapes = net, shapes
         self.values = [Value(v) for v in range(len(net.plan.blobs))]  # a layer may pass a value on
         self.definition = Definition(net.plan.blobs, tuple(self.values))

@@ -1,14 +1,3 @@
-"""How Caffe's layers are exported: a module of exporters for each module or package of netspec/layers."""
+"""How Caffe's layers are exported."""
 
-from netspec.export.layers import (
-    activation,
-    common,
-    contrast,
-    data,
-    loss,
-    normalization,
-    recurrent,
-    scale,
-    utility,
-    vision,
-)
+from netspec.export.layers import activation, common, loss, normalization, recurrent, utility, vision

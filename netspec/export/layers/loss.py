@@ -1,263 +1,152 @@
-"""Exporters of the losses and Accuracy."""
+"""The expressions of the losses and Accuracy."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 
-from netspec.export.exporter import Exporter, exports, rounded
+from netspec.export.exporter import exports, refusal, rounded
 from netspec.export.expression import Expression, call
-from netspec.export.formats.onnx import OnnxGraph
 from netspec.export.formats.torch_code import TorchCode
-from netspec.layers.loss.base import (
-    BATCH_SIZE,
-    FULL,
-    NONE,
-    VALID,
-)
+from netspec.export.layers.normalization import root
+from netspec.layers.loss.base import BATCH_SIZE, FULL, NONE, VALID
 from netspec.layers.loss.losses import ContrastiveLoss, EuclideanLoss, HingeLoss, SigmoidCrossEntropyLoss
-from netspec.layers.loss.scores import (
-    FLT_MIN,
-    LOG_THRESHOLD,
-    Accuracy,
-    InfogainLoss,
-    MultinomialLogisticLoss,
-    SoftmaxWithLoss,
-)
+from netspec.layers.loss.scores import Accuracy, InfogainLoss, MultinomialLogisticLoss, SoftmaxWithLoss
+
+DIVISORS = {FULL: "all", VALID: "counted", BATCH_SIZE: "items", NONE: "none"}
 
 
-class ClassifiedExport(Exporter):
-    def onnx_scores_and_labels(self, graph: OnnxGraph, scores: str, labels: str) -> tuple[str, str]:
-        """Write scores as (outer, classes, inner) and integer labels as (outer, 1, inner)."""
-        inner = self.layer.inner if None not in graph.sizes(0)[1:] else -1
-        outer = -1 if inner > 0 else 0  # a free size after axis 0: then the classes are axis 1
-        scores = graph.reshape(scores, [outer, self.layer.classes, inner])
-        shape = graph.node(
-            "Concat", graph.shape_of(scores, 0, 1), graph.constant([1]), graph.shape_of(scores, 2), axis=0
-        )
-        return scores, graph.cast(graph.node("Reshape", labels, shape), "int64")
-
-    def onnx_valid(self, graph: OnnxGraph, labels: str, ignore_label: int | None) -> tuple[str, str]:
-        """Write which labels count, as 0 or 1 (empty: all of them), and the labels with 0 for ignored ones."""
-        if ignore_label is None:
-            return "", labels
-        valid = graph.cast(graph.node("Not", graph.node("Equal", labels, graph.constant(ignore_label))), "int64")
-        return graph.cast(valid, "float32"), graph.node("Mul", labels, valid)
-
-    def torch_scores_and_labels(self, x: Expression, y: Expression, axis: int) -> tuple[Expression, Expression]:
-        """Return scores (outer, classes, ...) and labels (outer, ...), from scores with the classes on ``axis``."""
-        scores, labels = self.layer.bottom_shapes
-        axis %= len(scores)
-        before, after = scores[:axis], scores[axis + 1 :]
-        if labels == (*before, 1, *after):
-            y = y.squeeze(axis)
-        elif labels != (*before, *after):
-            y = y.reshape(x.select(axis, 0).shape)
-        if axis == 0:
-            return x[None], y[None]
-        return (x.flatten(0, axis - 1), y.flatten(0, axis - 1)) if axis > 1 else (x, y)
+def _scores_and_labels(layer: Any, x: Expression, y: Expression, axis: int) -> tuple[Expression, Expression]:
+    """Return scores (outer, classes, ...) and labels (outer, ...), from scores with the classes on ``axis``."""
+    scores, labels = layer.bottom_shapes[:2]
+    axis %= len(scores)
+    before, after = scores[:axis], scores[axis + 1 :]
+    if labels == (*before, 1, *after):
+        y = y.squeeze(axis)
+    elif labels != (*before, *after):
+        y = y.reshape(x.select(axis, 0).shape)
+    if axis == 0:
+        return x[None], y[None]
+    return (x.flatten(0, axis - 1), y.flatten(0, axis - 1)) if axis > 1 else (x, y)
 
 
-def onnx_normalized_sum(graph: OnnxGraph, losses: str, valid: str, mode: int) -> str:
-    """Write the sum of losses (outer, ...), divided as :func:`normalizer` says; an empty ``valid``: all count."""
-    if valid:
-        losses = graph.node("Mul", losses, valid)
-    if mode == VALID and valid:
-        counted = graph.node("Max", graph.node("ReduceSum", valid, keepdims=0), graph.constant(1.0))
-        return graph.node("Div", graph.node("ReduceSum", losses, keepdims=0), counted)
-    if mode in (FULL, VALID):
-        return graph.node("ReduceMean", losses, keepdims=0)
-    total = graph.node("ReduceSum", losses, keepdims=0)
-    return total if mode == NONE else graph.node("Div", total, onnx_items(graph, losses))
-
-
-def onnx_items(graph: OnnxGraph, value: str) -> str:
-    """Write the number of items, the size of axis 0, as a floating-point scalar."""
-    return graph.cast(graph.node("Squeeze", graph.shape_of(value, 0, 1)), "float32")
+def _normalized(layer: Any) -> dict[str, Any]:
+    """Return the options of a loss that say what its sum is divided by, and which label is ignored."""
+    ignored = {} if layer.ignore_label is None else {"ignore": layer.ignore_label}
+    return {"divide_by": DIVISORS[layer.normalization], **ignored}
 
 
 @exports(HingeLoss)
-class HingeLossExport(ClassifiedExport):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        layer = self.layer
-        x, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        classes = graph.constant(torch.arange(layer.classes).reshape(-1, 1))
-        of_label = graph.cast(graph.node("Equal", labels, classes), "float32")
-        sign = graph.node("Sub", graph.constant(1.0), graph.node("Mul", of_label, graph.constant(2.0)))
-        margins = graph.node("Relu", graph.node("Add", graph.constant(1.0), graph.node("Mul", sign, x)))
-        if layer.param.hinge_loss_param.norm == layer.L2:
-            margins = graph.node("Mul", margins, margins)
-        return onnx_normalized_sum(graph, margins, "", BATCH_SIZE)
-
-    def to_torch(self, code: TorchCode, x: Expression, y: Expression) -> Expression:
-        return call(hinge_loss, x, y, norm=2 if self.layer.param.hinge_loss_param.norm == self.layer.L2 else 1)
+def hinge(layer: Any, code: TorchCode, x: Expression, y: Expression) -> Expression:
+    return call(hinge_loss, x, y, norm=2 if layer.param.hinge_loss_param.norm == layer.L2 else 1)
 
 
 @exports(SigmoidCrossEntropyLoss)
-class SigmoidCrossEntropyLossExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        layer = self.layer
-        x, targets = bottoms
-        if layer.bottom_shapes[0] != layer.bottom_shapes[1]:
-            targets = graph.node("Reshape", targets, graph.shape_of(x))
-        softplus = graph.node("Softplus", graph.node("Neg", graph.node("Abs", x)))
-        linear = graph.node("Sub", graph.node("Relu", x), graph.node("Mul", x, targets))
-        valid = ""
-        if layer.ignore_label is not None:
-            ignored = graph.node("Equal", graph.cast(targets, "int64"), graph.constant(layer.ignore_label))
-            valid = graph.cast(graph.node("Not", ignored), "float32")
-        return onnx_normalized_sum(graph, graph.node("Add", linear, softplus), valid, layer.normalization)
-
-    def to_torch(self, code: TorchCode, x: Expression, y: Expression) -> Expression:
-        layer = self.layer
-        if layer.ignore_label is not None:
-            raise self.refusal("PyTorch", "torch's binary cross entropy cannot ignore a label")
-        if layer.bottom_shapes[0] != layer.bottom_shapes[1]:
-            y = y.reshape(x.shape)
-        if layer.normalization in (FULL, VALID):
-            return call(F.binary_cross_entropy_with_logits, x, y)
-        if layer.normalization == NONE:
-            return call(F.binary_cross_entropy_with_logits, x, y, reduction="sum")
-        return call(sigmoid_loss, x, y)
+def sigmoid_cross_entropy(layer: Any, code: TorchCode, x: Expression, y: Expression) -> Expression:
+    same = layer.bottom_shapes[0] == layer.bottom_shapes[1]
+    return call(sigmoid_loss, x, y if same else y.reshape(x.shape), **_normalized(layer))
 
 
 @exports(EuclideanLoss)
-class EuclideanLossExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms)
-        difference = graph.node("Sub", a, b)
-        total = graph.node("ReduceSum", graph.node("Mul", difference, difference), keepdims=0)
-        return graph.node("Div", total, graph.node("Mul", onnx_items(graph, a), graph.constant(2.0)))
-
-    def to_torch(self, code: TorchCode, x: Expression, y: Expression) -> Expression:
-        if self.layer.bottom_shapes[0] != self.layer.bottom_shapes[1]:
-            x, y = x.flatten(1), y.flatten(1)
-        return (x - y).square().sum() / (2 * x.shape[0])
+def euclidean(layer: Any, code: TorchCode, x: Expression, y: Expression) -> Expression:
+    if layer.bottom_shapes[0] != layer.bottom_shapes[1]:
+        x, y = x.flatten(1), y.flatten(1)
+    return (x - y).square().sum() / (2 * x.shape[0])
 
 
 @exports(ContrastiveLoss)
-class ContrastiveLossExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p = self.layer.param.contrastive_loss_param
-        a, b = (graph.node("Flatten", bottom, axis=1) for bottom in bottoms[:2])
-        difference = graph.node("Sub", a, b)
-        squared = graph.node("ReduceSum", graph.node("Mul", difference, difference), graph.constant([1]), keepdims=0)
-        distance = squared if p.legacy_version else graph.node("Sqrt", squared)
-        dissimilar = graph.node("Relu", graph.node("Sub", graph.constant(p.margin), distance))
-        if not p.legacy_version:
-            dissimilar = graph.node("Mul", dissimilar, dissimilar)
-        label = graph.cast(graph.reshape(bottoms[2], [-1]), "int64")
-        losses = graph.node("Where", graph.node("Equal", label, graph.constant(0)), dissimilar, squared)
-        return graph.node("Mul", graph.node("ReduceMean", losses, keepdims=0), graph.constant(0.5))
-
-    def to_torch(self, code: TorchCode, a: Expression, b: Expression, similar: Expression) -> Expression:
-        p = self.layer.param.contrastive_loss_param
-        loss = legacy_contrastive_loss if p.legacy_version else contrastive_loss
-        return call(loss, a, b, similar, margin=rounded(p.margin))
+def contrastive(layer: Any, code: TorchCode, a: Expression, b: Expression, similar: Expression) -> Expression:
+    param = layer.param.contrastive_loss_param
+    loss = legacy_contrastive_loss if param.legacy_version else contrastive_loss
+    return call(loss, a, b, similar, margin=rounded(param.margin))
 
 
 @exports(SoftmaxWithLoss)
-class SoftmaxWithLossExport(ClassifiedExport):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        layer = self.layer
-        scores, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        valid, labels = self.onnx_valid(graph, labels, layer.ignore_label)
-        softmax = graph.node("Softmax", scores, axis=1)
-        chosen = graph.node("GatherElements", softmax, labels, axis=1)
-        losses = graph.node("Neg", graph.node("Log", graph.node("Max", chosen, graph.constant(FLT_MIN))))
-        loss = onnx_normalized_sum(graph, losses, valid, layer.normalization)
-        return (loss,) if layer.num_tops == 1 else (loss, graph.reshape_to_top(softmax, 1))
-
-    def to_torch(self, code: TorchCode, scores: Expression, labels: Expression) -> Sequence[Expression]:
-        layer = self.layer
-        axis = layer.param.softmax_param.axis % len(layer.bottom_shapes[0])
-        x, y = self.torch_scores_and_labels(scores, labels, axis)
-        if layer.ignore_label is None and layer.normalization in (FULL, VALID):
-            loss = call(F.cross_entropy, x, y.long())
-        else:
-            divisor = {FULL: "all", VALID: "counted", BATCH_SIZE: "items", NONE: "none"}[layer.normalization]
-            options = {} if layer.ignore_label is None else {"ignore": layer.ignore_label}
-            loss = call(softmax_loss, x, y, divide_by=divisor, **options)
-        return (loss, call(F.softmax, scores, dim=axis))[: layer.num_tops]
+def softmax_with_loss(layer: Any, code: TorchCode, scores: Expression, labels: Expression) -> Sequence[Expression]:
+    axis = layer.param.softmax_param.axis % len(layer.bottom_shapes[0])
+    loss = call(softmax_loss, *_scores_and_labels(layer, scores, labels, axis), **_normalized(layer))
+    return (loss, call(F.softmax, scores.detach(), dim=axis))[: layer.num_tops]
 
 
 @exports(InfogainLoss)
-class InfogainLossExport(ClassifiedExport):
-    not_exported = "PyTorch has no loss with an infogain matrix"
-
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        layer = self.layer
-        scores, labels = self.onnx_scores_and_labels(graph, *bottoms[:2])
-        valid, labels = self.onnx_valid(graph, labels, layer.ignore_label)
-        if len(bottoms) == 3:
-            matrix = graph.reshape(bottoms[2], [layer.classes, layer.classes])
-        elif layer.matrix is not None:
-            matrix = graph.constant(layer.matrix.reshape(layer.classes, layer.classes))
-        else:
-            raise self.refusal("ONNX", "the infogain matrix was not read")
-        log_p = graph.node("LogSoftmax", scores, axis=1)
-        floored = graph.node("Max", log_p, graph.constant(math.log(LOG_THRESHOLD)))
-        rows = graph.node("Gather", matrix, graph.node("Squeeze", labels, graph.constant([1])), axis=0)
-        weighted = graph.node("Mul", graph.node("Transpose", rows, perm=[0, 2, 1]), floored)
-        losses = graph.node("Neg", graph.node("ReduceSum", weighted, graph.constant([1]), keepdims=1))
-        loss = onnx_normalized_sum(graph, losses, valid, layer.normalization)
-        return (loss,) if layer.num_tops == 1 else (loss, graph.reshape_to_top(graph.node("Exp", log_p), 1))
+def infogain(layer: Any, code: TorchCode, scores: Expression, labels: Expression, *given: Expression) -> Any:
+    if not given and layer.matrix is None:
+        raise refusal(layer, "the infogain matrix was not read")
+    matrix = given[0] if given else code.buffer(layer.matrix)
+    axis = layer.param.infogain_loss_param.axis % len(layer.bottom_shapes[0])
+    x, y = _scores_and_labels(layer, scores, labels, axis)
+    loss = call(infogain_loss, x, y, matrix.reshape(layer.classes, layer.classes), **_normalized(layer))
+    return (loss, call(F.softmax, scores.detach(), dim=axis))[: layer.num_tops]
 
 
 @exports(MultinomialLogisticLoss)
-class MultinomialLogisticLossExport(ClassifiedExport):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        p, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        chosen = graph.node("Max", graph.node("GatherElements", p, labels, axis=1), graph.constant(self.layer.least))
-        return onnx_normalized_sum(graph, graph.node("Neg", graph.node("Log", chosen)), "", BATCH_SIZE)
-
-    def to_torch(self, code: TorchCode, p: Expression, labels: Expression) -> Expression:
-        least = self.layer.least
-        return call(F.nll_loss, call(torch.log, p.flatten(1).clamp(min=least)), labels.flatten().long())
+def multinomial_logistic(layer: Any, code: TorchCode, p: Expression, labels: Expression) -> Expression:
+    return call(logistic_loss, p, labels, least=layer.least)
 
 
 @exports(Accuracy)
-class AccuracyExport(ClassifiedExport):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> Sequence[str]:
-        layer = self.layer
-        x, labels = self.onnx_scores_and_labels(graph, *bottoms)
-        counted, known = self.onnx_valid(graph, labels, layer.ignore_label)
-        own = graph.node("GatherElements", x, known, axis=1)
-        as_good = graph.cast(graph.node("GreaterOrEqual", x, own), "float32")
-        rank = graph.node("ReduceSum", as_good, graph.constant([1]), keepdims=1)
-        right = graph.cast(graph.node("LessOrEqual", rank, graph.constant(float(layer.top_k))), "float32")
-        accuracy = onnx_normalized_sum(graph, right, counted, VALID)
-        if layer.num_tops == 1:
-            return (accuracy,)
-        classes = graph.constant(torch.arange(layer.classes).reshape(-1, 1))
-        of_class = graph.cast(graph.node("Equal", labels, classes), "float32")  # an ignored label may also be a class
-        of_class = graph.node("Mul", of_class, counted) if counted else of_class
-        axes = graph.constant([0, 2])
-        occurrences = graph.node("ReduceSum", of_class, axes, keepdims=0)
-        hits = graph.node("ReduceSum", graph.node("Mul", of_class, right), axes, keepdims=0)
-        return accuracy, graph.node("Div", hits, graph.node("Max", occurrences, graph.constant(1.0)))
-
-    def to_torch(self, code: TorchCode, scores: Expression, labels: Expression) -> Expression:
-        layer = self.layer
-        if layer.num_tops > 1:
-            raise self.refusal("PyTorch", "it is exported without the accuracy of each class")
-        x, y = self.torch_scores_and_labels(scores, labels, layer.param.accuracy_param.axis)
-        return call(accuracy, x, y, top_k=layer.top_k, ignore_label=layer.ignore_label)
+def accuracies(
+    layer: Any, code: TorchCode, scores: Expression, labels: Expression
+) -> Expression | Sequence[Expression]:
+    x, y = _scores_and_labels(layer, scores, labels, layer.param.accuracy_param.axis)
+    options = {"top_k": layer.top_k, "ignore": layer.ignore_label}
+    share = call(accuracy, x, y, **options)
+    return share if layer.num_tops == 1 else (share, call(accuracy_by_class, x, y, **options))
 
 
-def sigmoid_loss(scores, targets):
-    """Return the cross entropy of sigmoid(scores), summed for each item and averaged over the items."""
-    total = F.binary_cross_entropy_with_logits(scores, targets, reduction="sum")
-    return total / scores.shape[0]
+def divided(losses, labels, divide_by, ignore):
+    """Return the sum of the losses whose label counts, divided by a number of them."""
+    every, items, counted = labels.numel(), labels.shape[0], labels.numel()
+    if ignore is not None:
+        valid = (labels != ignore).to(losses.dtype)
+        losses, counted = losses * valid, valid.sum().clamp(min=1)
+    counts = {"all": every, "counted": counted, "items": items, "none": 1}
+    return losses.sum() / counts[divide_by]
+
+
+def log_softmax(scores, least):
+    """Return the logarithms of softmax(scores), at least a number, which their gradient does not know."""
+    found = F.log_softmax(scores, 1)
+    return found + (found.clamp(min=least) - found).detach()
+
+
+def softmax_loss(scores, labels, divide_by, ignore=None):
+    """Return the sum of -log(softmax(scores)[label]), at most 87.3 each, divided as ``divide_by`` says."""
+    labels = labels.long()
+    chosen = labels if ignore is None else labels * (labels != ignore)
+    losses = -log_softmax(scores, -87.33654).gather(1, chosen[:, None])[:, 0]
+    return divided(losses, labels, divide_by, ignore)
+
+
+def infogain_loss(scores, labels, matrix, divide_by, ignore=None):
+    """Return the sum of -matrix[label] log(softmax(scores)), divided as ``divide_by`` says."""
+    labels = labels.long()
+    chosen = labels if ignore is None else labels * (labels != ignore)
+    weights = matrix.detach()[chosen].movedim(-1, 1)
+    losses = -(weights * log_softmax(scores, -46.0517)).sum(1)
+    return divided(losses, labels, divide_by, ignore)
+
+
+def logistic_loss(p, labels, least):
+    """Return the mean of -log(p[label])."""
+    chosen = p.flatten(1).gather(1, labels.reshape(-1, 1).long())
+    return -chosen.clamp(min=least).log().mean()
+
+
+def sigmoid_loss(x, targets, divide_by, ignore=None):
+    """Return the sum of the cross entropy of sigmoid(x) and targets, divided as ``divide_by`` says."""
+    targets = targets.detach()
+    losses = targets * F.softplus(-x) + (1 - targets) * F.softplus(x)
+    return divided(losses, targets.long(), divide_by, ignore)
 
 
 def contrastive_loss(a, b, similar, margin):
     """Return the mean over pairs of d**2 / 2 if similar, else max(margin - d, 0)**2 / 2."""
     squared = (a - b).flatten(1).square().sum(1)
-    dissimilar = F.relu(margin - squared.sqrt()).square()
+    dissimilar = F.relu(margin - root(squared, 1e-4)).square()
     return torch.where(similar.flatten().long() != 0, squared, dissimilar).mean() / 2
 
 
@@ -275,23 +164,26 @@ def hinge_loss(scores, labels, norm):
     return F.relu(1 + sign * scores).pow(norm).sum() / scores.shape[0]
 
 
-def softmax_loss(scores, labels, divide_by, ignore=-100):
-    """Return the sum of the cross entropy of softmax(scores), divided by the number of labels."""
-    labels = labels.long()
-    total = F.cross_entropy(scores, labels, ignore_index=ignore, reduction="sum")
-    counted = (labels != ignore).sum().clamp(min=1)
-    items = labels.shape[0]
-    counts = {"all": labels.numel(), "counted": counted, "items": items, "none": 1}
-    return total / counts[divide_by]
+def hits(scores, labels, top_k, ignore):
+    """Return labels, which of them count, and which of these are among the top_k scores; equal scores are higher."""
+    scores, labels = scores.detach(), labels[:, None].long()
+    counted = torch.ones_like(labels) if ignore is None else (labels != ignore).long()
+    labels = labels * counted
+    rank = (scores >= scores.gather(1, labels)).to(scores.dtype).sum(1, keepdim=True)
+    counted = counted.to(scores.dtype)
+    return labels, counted, (rank <= top_k).to(scores.dtype) * counted
 
 
-def accuracy(scores, labels, top_k, ignore_label):
-    """Return the share of labels among the top_k scores; an equal score counts as higher."""
-    scores = scores.flatten(2) if scores.dim() > 2 else scores[:, :, None]
-    labels = labels.reshape(scores.shape[0], -1).long()
-    counted = torch.ones_like(labels)
-    if ignore_label is not None:
-        counted = (labels != ignore_label).long()
-    own = scores.gather(1, (labels * counted)[:, None])
-    right = ((scores >= own).sum(1) <= top_k) & (counted > 0)
+def accuracy(scores, labels, top_k, ignore):
+    """Return the share of labels that are among the top_k scores."""
+    _, counted, right = hits(scores, labels, top_k, ignore)
     return right.sum() / counted.sum().clamp(min=1)
+
+
+def accuracy_by_class(scores, labels, top_k, ignore):
+    """Return the share of the labels of each class that are among the top_k scores."""
+    labels, counted, right = hits(scores, labels, top_k, ignore)
+    classes = torch.arange(scores.shape[1], device=scores.device)
+    of_class = (labels.reshape(-1, 1) == classes).to(scores.dtype)
+    shares = [(of_class * x.reshape(-1, 1)).sum(0) for x in (right, counted)]
+    return shares[0] / shares[1].clamp(min=1)

@@ -1,68 +1,107 @@
-"""Exporters of BatchNorm."""
+"""The expressions of BatchNorm, LRN, MVN."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from netspec.export.exporter import Exporter, exports, rounded
-from netspec.export.expression import Expression, Submodule, call
-from netspec.export.formats.onnx import OnnxGraph
+from netspec.export.exporter import exports, rounded
+from netspec.export.expression import Expression, call, with_axes
 from netspec.export.formats.torch_code import TorchCode
+from netspec.layers.contrast import ACROSS_CHANNELS, LRN, MVN
 from netspec.layers.normalization import BatchNorm
 from netspec.layers.scale import Scale
+from netspec.proto.schema import TEST
 
 
 @exports(BatchNorm)
-class BatchNormExport(Exporter):
-    def to_onnx(self, graph: OnnxGraph, *bottoms: str) -> str:
-        layer = self.layer
-        eps = layer.param.batch_norm_param.eps
-        if not layer.use_global_stats:
-            return onnx_normalized(graph, bottoms[0], len(layer.bottom_shapes[0]), eps)
-        ones, zeros = torch.ones(layer.channels), torch.zeros(layer.channels)
-        constants = [graph.constant(values) for values in (ones, zeros, *layer.stored_statistics())]
-        return graph.node("BatchNormalization", *bottoms, *constants, epsilon=eps)
-
-    def to_torch(self, code: TorchCode, x: Expression) -> Expression:
-        layer = self.layer
-        eps = rounded(layer.param.batch_norm_param.eps)
-        if not layer.use_global_stats:
-            return call(F.batch_norm, x, None, None, training=True, eps=eps)
-        affine = self.affine(code)
-        mean, variance = layer.stored_statistics()
-        return torch_batch_norm(code, len(layer.bottom_shapes[0]), mean, variance, eps, **affine)(x)
-
-    def affine(self, code: TorchCode) -> dict[str, torch.Tensor]:
-        """Return the weight and bias of the module, those of a Scale that alone reads the top, or nothing."""
-        scale = code.absorb(lambda after: type(after) is Scale and after.by_channel)
-        if scale is None:
-            return {}
+def batch_norm(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    if not layer.use_global_stats:
+        return call(normalize_batch, x, eps=rounded(layer.eps))
+    affine = {}
+    if is_module(layer) and (scale := code.absorb(lambda after: type(after) is Scale and after.by_channel)):
         weight = scale.blob(0)
-        return {"weight": weight, "bias": scale.blob(1) if len(scale.blobs) > 1 else torch.zeros_like(weight)}
+        affine = {"weight": weight, "bias": scale.blob(1) if len(scale.blobs) > 1 else torch.zeros_like(weight)}
+    return by_statistics(layer, code, x, *layer.stored_statistics(), **affine)
 
 
-def torch_batch_norm(
-    code: TorchCode, axes: int, mean: torch.Tensor, variance: torch.Tensor, eps: float, **affine: torch.Tensor
-) -> Submodule:
-    """Return torch's batch normalization by stored statistics; ``affine`` has its weight and bias, or is empty."""
+def is_module(layer: Any) -> bool:
+    """Return whether the normalization by stored statistics is a module of torch.
+
+    It is none for so many axes, and none of a training net: in training, it would take the statistics of batches.
+    """
+    return layer.phase == TEST and len(layer.bottom_shapes[0]) <= 5
+
+
+def by_statistics(
+    layer: Any, code: TorchCode, x: Expression, mean: torch.Tensor, variance: torch.Tensor, **affine: torch.Tensor
+) -> Expression:
+    """Return the normalization by stored statistics; ``affine`` has a module's weight and bias, or is empty."""
+    eps = rounded(layer.eps)
+    if not is_module(layer):
+        return call(F.batch_norm, x, code.buffer(mean), code.buffer(variance), eps=eps)
     count = torch.zeros((), dtype=torch.long)
     state = {**affine, "running_mean": mean, "running_var": variance, "num_batches_tracked": count}
     options = {**({} if eps == 1e-5 else {"eps": eps}), **({} if affine else {"affine": False})}
-    cls = (nn.BatchNorm1d, nn.BatchNorm1d, nn.BatchNorm1d, nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)[axes]
-    return code.module(cls, len(mean), state=state, **options)
+    cls = {4: nn.BatchNorm2d, 5: nn.BatchNorm3d}.get(len(layer.bottom_shapes[0]), nn.BatchNorm1d)
+    return code.module(cls, len(mean), state=state, **options)(x)
 
 
-def onnx_normalized(graph: OnnxGraph, data: str, axes: int, eps: float) -> str:
-    """Write the normalization of a batch: subtract each channel's mean and divide by its standard deviation."""
-    centered = graph.node("Sub", data, _onnx_channel_means(graph, data, axes))
-    variance = _onnx_channel_means(graph, graph.node("Mul", centered, centered), axes)
-    return graph.node("Div", centered, graph.node("Sqrt", graph.node("Add", variance, graph.constant(eps))))
+@exports(LRN)
+def lrn(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    size, *numbers = layer.settings
+    alpha, beta, k = map(rounded, numbers)
+    if layer.param.lrn_param.norm_region != ACROSS_CHANNELS:
+        return call(spatial_response_norm, x, size, alpha, beta)
+    usual = {"alpha": 1e-4, "beta": 0.75, "k": 1.0}
+    given = {"alpha": alpha, "beta": beta, "k": k}
+    options = {name: number for name, number in given.items() if number != usual[name]}
+    return call(F.local_response_norm, x, size, **options)
 
 
-def _onnx_channel_means(graph: OnnxGraph, data: str, axes: int) -> str:
-    # One after the other, since means over nonadjacent axes are wrong in OpenCV 5.0.
-    for part in ([0], list(range(2, axes))):
-        data = graph.node("ReduceMean", data, axes=part, keepdims=1) if part else data
-    return data
+@exports(MVN)
+def mvn(layer: Any, code: TorchCode, x: Expression) -> Expression:
+    param = layer.param.mvn_param
+    x = with_axes(x, 4 - len(layer.bottom_shapes[0]))
+    axes = (1, 2, 3) if param.across_channels else (2, 3)
+    if not param.normalize_variance:
+        return call(center, x, axes)
+    return call(standardize, x, axes, eps=rounded(param.eps))
+
+
+def batch_mean(x):
+    """Return the mean of each channel."""
+    mean = x.mean(0, keepdim=True)
+    return mean.mean(tuple(range(2, x.dim())), keepdim=True) if x.dim() > 2 else mean
+
+
+def normalize_batch(x, eps):
+    """Subtract each channel's mean over the batch and divide by the standard deviation."""
+    x = x - batch_mean(x)
+    return x / (batch_mean(x.square()) + eps).sqrt()
+
+
+def spatial_response_norm(x, size, alpha, beta):
+    """Divide by a power of 1 + alpha times the mean square of size x size pixels."""
+    mean = F.avg_pool2d(x * x, size, stride=1, padding=size // 2)
+    return x / (1 + alpha * mean).pow(beta)
+
+
+def center(x, axes):
+    """Subtract the mean over some axes."""
+    return x - x.mean(axes, keepdim=True)
+
+
+def standardize(x, axes, eps):
+    """Subtract the mean over some axes and divide by the standard deviation plus eps."""
+    x = center(x, axes)
+    return x / (root(x.square().mean(axes, keepdim=True), eps) + eps)
+
+
+def root(x, least):
+    """Return the square root; its gradient is 1 / 2 (root + least), which is finite at 0."""
+    at = x.detach()
+    return at.sqrt() + (x - at) / (2 * (at.sqrt() + least))

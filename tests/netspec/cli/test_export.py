@@ -131,6 +131,15 @@ def test_part_of_a_net(onnx: Any, net: Net, run: Run) -> None:
     assert 'no blob "conf" in this net; did you mean "conv"?' in run(*words, "conf").fault
 
 
+@pytest.mark.parametrize("command", ["export --to torch --out part.py", "fold --out part"])
+def test_layers_behind_the_blobs_of_a_part_are_not_built(command: str, net: Net, run: Run) -> None:
+    after = 'layer { name: "py" type: "Python" bottom: "bn" top: "py" python_param { module: "none" layer: "None" } }'
+    Path(MODEL).write_text(TEXT + after)
+    name, *words = command.split()
+    assert run(name, MODEL, "--weights", WEIGHTS, *words).status != 0
+    assert run(name, MODEL, "--weights", WEIGHTS, *words, "--blob", "bn").status == 0
+
+
 def test_preprocessing_is_exported(onnx: Any, net: Net, run: Run) -> None:
     words = ("export", MODEL, "--weights", WEIGHTS, "--to", "onnx", "--out", "net.onnx", "--mean", "1,2,3", "--swap")
     assert run(*words, "--scale", "0.5").status == 0

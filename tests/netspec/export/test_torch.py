@@ -14,7 +14,6 @@ import torch
 
 import netspec
 from exported import assert_same, golden_net, here, other_inputs, random_inputs, run_module, source_module, trained
-from netspec.export.formats.module import torch_module
 from netspec.export.formats.shapes import settled
 from netspec.export.formats.torch import export_torch, torch_source
 from netspec.export.formats.torch_code import write_definition
@@ -25,7 +24,6 @@ from paths import GOLDEN, ROOT
 pytestmark = pytest.mark.slow
 
 CASES = sorted((GOLDEN / "layers").iterdir())
-REFUSED = {"accuracy_topk_perclass": "without the accuracy of each class", "infogain": "infogain matrix"}
 
 
 def is_formatted(text: str) -> bool:
@@ -35,21 +33,15 @@ def is_formatted(text: str) -> bool:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda path: path.name)
-def test_source_and_module_of_a_golden_layer_compute_the_same(case: Path) -> None:
+def test_source_of_a_golden_layer_computes_the_same(case: Path) -> None:
     net, inputs = golden_net(case)
-    if case.name in REFUSED:
-        with pytest.raises(netspec.SpecError, match=REFUSED[case.name]):
-            torch_source(net)
-        return
-    modules = [source_module(net), torch_module(net)]
-    for module in modules:
-        again, _ = golden_net(case)  # a recurrent net remembers what it saw
-        assert_same(run_module(module, net, inputs), here(again, inputs))
+    module = source_module(net)
+    again, _ = golden_net(case)  # a recurrent net remembers what it saw
+    assert_same(run_module(module, net, inputs), here(again, inputs))
     assert is_formatted(torch_source(net)[0])
     inputs = other_inputs(net, settled(net, lambda shapes: write_definition(net, shapes))[1], inputs)
-    for module in modules:
-        again, _ = golden_net(case)  # a recurrent net remembers what it saw
-        assert_same(run_module(module, net, inputs), here(again, inputs))
+    again, _ = golden_net(case)
+    assert_same(run_module(module, net, inputs), here(again, inputs))
 
 
 def test_the_module_runs_without_netspec(tmp_path: Path) -> None:
@@ -141,17 +133,17 @@ def test_torch_export_archives_the_source_for_other_batches_and_sizes(
 
 def test_inputs_of_other_sizes_are_refused(net_of: Callable[..., Net]) -> None:
     net = trained(net_of(PAIRS))
-    for module in (source_module(net), torch_module(net)):
-        image, label, other = torch.zeros(3, 1, 6, 6), torch.zeros(3), torch.zeros(5, 4)
-        module(image, image, label, other)
-        for wrong in (
-            (torch.zeros(3, 1, 4, 9), image, label, other),  # as many numbers
-            (torch.zeros(3, 1, 12, 3), image, label, other),
-            (torch.zeros(1, 1, 6, 6), image, label, other),  # torch would use it three times
-            (image, image, label[:, None], other),
-        ):
-            with pytest.raises(ValueError, match="expected"):
-                module(*wrong)
+    module = source_module(net)
+    image, label, other = torch.zeros(3, 1, 6, 6), torch.zeros(3), torch.zeros(5, 4)
+    module(image, image, label, other)
+    for wrong in (
+        (torch.zeros(3, 1, 4, 9), image, label, other),  # as many numbers
+        (torch.zeros(3, 1, 12, 3), image, label, other),
+        (torch.zeros(1, 1, 6, 6), image, label, other),  # torch would use it three times
+        (image, image, label[:, None], other),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            module(*wrong)
     with pytest.raises(ValueError, match=re.escape("b has shape (4, 1, 6, 6), expected (3, 1, 6, 6)")):
         source_module(net)(image, torch.zeros(4, 1, 6, 6), label, other)
 

@@ -3,6 +3,7 @@
 import argparse
 import logging
 import re
+import signal
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from netspec import log
 from netspec.errors import SpecError, Where
-from netspec.terminal.commands import WrongUsage, refuse, run
+from netspec.terminal.commands import Interrupted, WrongUsage, interruptible, refuse, run
 from netspec.terminal.parser import Commands, Parser
 
 
@@ -247,3 +248,13 @@ def test_programming_errors_are_not_hidden() -> None:
 
     with pytest.raises(AssertionError):
         run(command(fail), ["convert"])
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_signal_in_a_finalizer_is_not_lost() -> None:
+    class Ended:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Interrupted), interruptible():
+        Ended()
