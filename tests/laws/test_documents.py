@@ -18,7 +18,6 @@ import netspec
 import netspec.cli
 from documents import DOCUMENTS, PROGRAMS, blocks, commands
 from netspec.cli import run_script
-from netspec.errors import SpecError
 from paths import GOLDEN, ROOT
 
 PARSERS = {
@@ -119,34 +118,6 @@ def test_the_counts_of_faithful_json_equal_the_golden_folders() -> None:
     folders = {"layers": "layers", "trainings": "train", "examples": "examples/runs"}
     counts = {what: len(list((GOLDEN / folder).iterdir())) for what, folder in folders.items()}
     assert {row["what"]: row["to the last bit"] for row in rows} == {what: f"{n} of {n}" for what, n in counts.items()}
-
-
-ROWS = [
-    {"net": "a", "run by": "netspec", "ms": 12.345, "CPU / pytorch": 0.7312, "n": 12000},
-    {"net": "a", "run by": "pytorch", "ms": 0.5, "CPU / pytorch": None, "n": 1},
-]
-
-
-@pytest.mark.parametrize(
-    ("marker", "shown"),
-    [
-        ("table: x; net, ms, CPU / pytorch as / P; run by=netspec", "| net | ms | / P |\n| a | 12.3 | 0.73 |"),
-        ("table: x; net, run by: ms", "| net | netspec | pytorch |\n| a | 12.3 | 0.5 |"),
-        ("table: x; n", "| n |\n| 12,000 |\n| 1 |"),
-        ("figure: x; CPU / pytorch; run by=netspec", "0.73"),
-        ("figure: x; ms", "2 rows"),
-        ("table: x; speed", "no column 'speed'"),
-        ("table: y", "there is no"),
-    ],
-    ids=["row_of_a_table", "columns_by_value", "integers", "figure", "several_rows", "unknown_column", "unknown_file"],
-)
-def test_markers_become_numbers_or_are_refused(marker: str, shown: str, tmp_path: Path) -> None:
-    (tmp_path / "x.json").write_text(json.dumps({"rows": ROWS}))
-    try:
-        text = benchmarks.pages.updated(f"<!-- {marker} -->old<!-- end -->", tmp_path)
-    except SpecError as fault:
-        text = str(fault)
-    assert shown in re.sub(r"\|( --- \|)+\n", "", text)
 
 
 # Every difference from Caffe in the documentation names tests that exist

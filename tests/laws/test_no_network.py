@@ -1,33 +1,15 @@
-"""No command and no engine uses the network."""
+"""No engine uses the network."""
 
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import NoReturn
 
 import pytest
 
-from faults.commands import CASES
 from paths import ROOT
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_a_command_opens_no_connection(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*arguments: object, **options: object) -> NoReturn:
-        pytest.fail("a connection")
-
-    monkeypatch.chdir(tmp_path)
-    Path("out").mkdir()
-    CASES[name].prepare()
-    for function in ("connect", "connect_ex", "bind", "sendto"):
-        monkeypatch.setattr(socket.socket, function, refuse)
-    for function in ("getaddrinfo", "gethostbyname", "create_connection"):
-        monkeypatch.setattr(socket, function, refuse)
-    assert CASES[name].main(CASES[name].words) == 0
 
 
 ENGINE = (Path(__file__).parent / "programs" / "engine.py").read_text()

@@ -15,7 +15,7 @@ from paths import GOLDEN, ROOT
 pytestmark = pytest.mark.slow
 
 OPTIONAL = ("fast", "dialects", "export", "compat", "inspect")
-RANDOM_NETS = 100
+RANDOM_NETS = 30
 MOST_LINES = 18_218  # of Python in the core
 NOT_CORE = (*OPTIONAL, "cli", "terminal", "pycaffe.py", "dnn.py")
 

@@ -1,6 +1,5 @@
 """Every layer type: its docstring, shapes, gradient, results on a GPU, and error for a wrong number of bottoms."""
 
-import ast
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,10 +16,9 @@ from laws.examples import EXAMPLES, Shape
 from netspec.errors import SpecError, Where
 from netspec.graph.options import BuildOptions
 from netspec.layers import Context, Layer, Random, layer_class, layer_types
-from netspec.layers.data.files import ReadingLayer
 from netspec.layers.data.memory import MemoryData
 from netspec.proto.schema import TEST, LayerParameter
-from paths import GOLDEN, ROOT
+from paths import GOLDEN
 
 TYPES = [name for name in layer_types() if getattr(layer_class(name), "__module__", "").startswith("netspec.layers.")]
 
@@ -170,21 +168,3 @@ def test_a_wrong_number_of_bottoms_is_refused(name: str, folder: Path, monkeypat
         with pytest.raises(SpecError, match=rf"^bottom: found {len(given)} bottom blob"):
             build(name, folder, given)
     assert wrong or name == "Python"
-
-
-def undescribed() -> Iterator[str]:
-    """Yield the public methods of layers without a docstring that Layer and ReadingLayer do not describe either."""
-    described = {*vars(Layer), *vars(ReadingLayer)}
-    for folder in ("layers", "dialects"):
-        for path in sorted((ROOT / "netspec" / folder).rglob("*.py")):
-            classes = [each for each in ast.walk(ast.parse(path.read_text())) if isinstance(each, ast.ClassDef)]
-            public = [each for each in classes if not each.name.startswith("_")]
-            for method in (method for cls in public for method in cls.body if isinstance(method, ast.FunctionDef)):
-                marks = {ast.unparse(each).rpartition(".")[2] for each in method.decorator_list}
-                known = method.name in described or marks & {"override", "staticmethod", "setter"}
-                if not (known or method.name.startswith("_") or ast.get_docstring(method)):
-                    yield f"{path.relative_to(ROOT)}:{method.lineno}: {method.name}"
-
-
-def test_methods_have_docstrings() -> None:
-    assert list(undescribed()) == []

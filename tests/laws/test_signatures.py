@@ -1,9 +1,5 @@
-"""Public functions accept a single string in place of a list of one, and refuse unknown choices.
+"""Public functions accept a single string in place of a list of one, and refuse unknown choices."""
 
-No function has more than six parameters, except those listed here with a reason.
-"""
-
-import ast
 import inspect
 import os
 from collections.abc import Callable, Iterator
@@ -20,7 +16,6 @@ from loopclosure.detector.decision import DetectorSettings
 from netspec.inspect.features.describer import Describer
 from netspec.net.net import Net
 from netspec.solver.solver import Solver
-from paths import ROOT
 
 NET = """
 layer { name: "data" type: "HDF5Data" top: "data" top: "label" hdf5_data_param { source: "list" batch_size: 1 } }
@@ -89,46 +84,6 @@ def _files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         netspec.save_weights(netspec.load_net(f"{model}.prototxt"), WEIGHTS if model == "net" else "image.caffemodel")
     yield
     os.chdir(before)
-
-
-MOST_PARAMETERS = 6  # without self, cls, and the ctx of a torch.autograd.Function
-PACKAGES = ("netspec", "loopclosure", "lmdb_build", "benchmarks")
-# Functions that may have more, and why.
-DOORS = {
-    # Public, called with keywords.
-    "netspec/load.py: load_net",
-    "netspec/load.py: load_solver",
-    "netspec/net/one_layer.py: layer",
-    "netspec/inspect/features/describer.py: Describer.__init__",
-    # Caffe's own signatures.
-    "netspec/compat/pycaffe/classifier.py: Classifier.__init__",
-    "netspec/compat/pycaffe/detector.py: Detector.__init__",
-    # Copied into the source that `netspec export` writes, where a call shows a layer's blobs and fields one by one.
-    "netspec/export/layers/recurrent.py: rnn",
-    "loopclosure/decision/decider.py: Decider._fallen",
-    "loopclosure/detector/detector.py: LoopDetector._looked_at",
-    "netspec/export/layers/recurrent.py: lstm",
-    "netspec/export/dialects/ssd.py: detection_output",
-    "netspec/export/dialects/ssd.py: prior_boxes",
-}
-
-
-def with_many_parameters(path: Path) -> Iterator[str]:
-    """Yield the functions of a file that have more than MOST_PARAMETERS, methods with the name of their class."""
-    tree = ast.parse(path.read_text())
-    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    class_of = {id(child): f"{node.name}." for node in classes for child in node.body}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-            if len([each for each in given if each.arg not in ("self", "cls", "ctx")]) > MOST_PARAMETERS:
-                yield f"{path.relative_to(ROOT).as_posix()}: {class_of.get(id(node), '')}{node.name}"
-
-
-def test_functions_have_at_most_six_parameters() -> None:
-    paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    found = {name for path in paths for name in with_many_parameters(path)}
-    assert found == DOORS
 
 
 def test_every_public_function_is_called_here() -> None:

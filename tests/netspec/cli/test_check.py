@@ -60,14 +60,6 @@ def test_check_can_show_caffes_log(run: Run) -> None:
     assert loud.out == quiet.out
 
 
-def test_check_builds_all_nets_of_a_solver(run: Run, edited: Edit) -> None:
-    solver = edited(SOLVER, "snapshot_after_train: false", "", "test_interval: 1000", "test_interval: 60")
-    result = run("check", solver, *PAIR_SHAPE, "--json")
-    assert (result.status, result.err) == (0, "")
-    assert sorted(json.loads(result.out)) == ["test net #0", "train net"]
-    assert run("check", solver, *PAIR_SHAPE).out.count("\nconv2_p ") == 2
-
-
 def test_check_opens_no_data(run: Run) -> None:
     Path("pairs").unlink()
     assert run("check", NET, *PAIR_SHAPE).status == 0

@@ -1,7 +1,6 @@
 """The commands, called as ``netspec`` calls them: effects, messages and exit status."""
 
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -75,29 +74,12 @@ def test_train_accepts_a_solver_as_an_option_or_by_position(run: Run, edited: Ed
     assert Path("sgd_step/ref_iter_1.caffemodel").is_file()
 
 
-@pytest.mark.parametrize("words", [["train", SOLVER], ["test", "--model", NET]], ids=["train", "test"])
-def test_missing_weights_are_reported_before_a_net_is_built(run: Run, words: list[str]) -> None:
-    result = run(*words, "--weights", "nope.caffemodel")
-    assert result.fault.startswith("nope.caffemodel: cannot be read: No such file or directory; ")
-    assert "layer_factory" not in result.err
-
-
 @pytest.mark.slow
 def test_a_solver_without_max_iter_is_not_trained(run: Run, edited: Edit) -> None:
     """Caffe trains nothing and exits with 0; load_solver and step(n) need no max_iter."""
     solver = edited(SOLVER, "max_iter: 60", "")
     reported = "has no max_iter, so there is nothing to train; add max_iter: N, the number of iterations"
     assert run("train", solver).fault == f"{solver}: {reported}"
-
-
-def test_quiet_shows_only_warnings(run: Run, edited: Edit) -> None:
-    """Weights that fit no layer, and another batch size at a resume."""
-    Path("other.prototxt").write_text(Path(NET).read_text().replace('name: "', 'name: "other_'))
-    solver = edited(SOLVER, NET, "other.prototxt", "max_iter: 60", "max_iter: 1")
-    result = run("train", solver, "--weights", INIT, "-q")
-    assert result.status == 0
-    assert "contains weights for none of the net's" in result.err
-    assert {line[0] for line in result.err.splitlines()} == {"W"}
 
 
 def test_tools_train(run: Run, edited: Edit) -> None:
@@ -131,14 +113,6 @@ def test_train_applies_level_and_stages_to_the_training_net_only(run: Run, edite
     assert [len(lines) for lines in created] == [0, 0, 1]
 
 
-def test_train_restores_signal_handlers(run: Run) -> None:
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGHUP)
-    assert run("train", "nowhere.prototxt").fault.startswith(
-        "nowhere.prototxt: cannot be read: No such file or directory; "
-    )
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGHUP)) == before
-
-
 # test and time
 
 
@@ -152,12 +126,6 @@ def test_test_scores_a_net_on_its_test_data(run: Run) -> None:
     mean = f"{np.mean(scores):.4g}"
     assert result.messages[-1].startswith(f"loss = {mean}")
     assert result.messages[-2].startswith(f"Loss: {mean}")
-
-
-def test_test_loads_several_weights_and_the_last_has_priority(run: Run) -> None:
-    one = run("test", "--model", NET, "--weights", "sgd_step/ref_iter_60.caffemodel", "--iterations", 1)
-    two = run("test", "--model", NET, "--weights", f"{INIT},sgd_step/ref_iter_60.caffemodel", "--iterations", 1)
-    assert one.messages[-1] == two.messages[-1]
 
 
 def test_time_measures_each_layer(run: Run) -> None:
@@ -286,28 +254,6 @@ def test_a_missing_source_is_reported_before_the_log(run: Run, kind: str, says: 
     assert "\n" not in line
 
 
-def test_a_solver_without_a_net_is_refused(run: Run, edited: Edit) -> None:
-    solver = edited(SOLVER, f'net: "{NET}"', "")
-    assert run("train", solver).fault.startswith(
-        "edited.prototxt: the solver has no net to train, expected exactly one"
-    )
-    assert run("check", solver).fault.startswith(
-        "edited.prototxt: the solver has no net to train, expected exactly one"
-    )
-    assert run("train", edited(SOLVER, NET, "nowhere.prototxt")).fault == (
-        'edited.prototxt:1:1: net "nowhere.prototxt" is not a file; relative paths start from ' + os.getcwd()
-    )
-
-
-def test_an_unwritable_prefix_is_refused(run: Run, edited: Edit) -> None:
-    solver = edited(SOLVER, "sgd_step/ref", "nowhere/ref", "display: 10", "display: 10 snapshot: 5")
-    fault = run("train", solver).fault
-    assert fault.startswith(
-        'edited.prototxt:9:1: cannot write to snapshot prefix "nowhere/ref": No such file or directory'
-    )
-    assert fault.endswith(f"; relative paths start from {Path.cwd()}")
-
-
 def test_missing_and_invalid_weights_are_refused(run: Run) -> None:
     missing = f"nowhere.caffemodel: cannot be read: No such file or directory; relative paths start from {os.getcwd()}"
     assert run("train", SOLVER, "--weights", "nowhere.caffemodel").fault == missing
@@ -368,21 +314,6 @@ def test_help_ends_with_status_0(run: Run) -> None:
     result = run("train", "--help")
     assert result.status == 0
     assert "--sighup_effect" in result.out
-
-
-def test_weights_that_fit_no_layer_are_refused(run: Run) -> None:
-    other = NetParameter.FromString(Path(INIT).read_bytes())
-    for layer in other.layer:
-        layer.name += "_b"
-    Path("other.caffemodel").write_bytes(other.SerializeToString())
-    Path("images").mkdir()
-    cv2.imwrite("images/1.png", np.zeros((28, 28), np.uint8))
-    words = ("--model", NET, "--weights", "other.caffemodel")
-    extract = ("extract", *words, "--blob", "feat", "--out", "f.npz")
-    for command in (("test", *words), extract, (*extract, "--images", "images")):
-        fault = run(*command).fault
-        assert fault.startswith("other.caffemodel: contains weights for none of the net's ")
-        assert fault.endswith("is it the file of another net?")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import torch
 import netspec
 from netspec.data.database import open_reader
 from netspec.data.datum import datum_to_array, parse_datum
-from paths import GOLDEN, ROOT
+from paths import GOLDEN
 
 NET = "sgd_step/train_val.prototxt"
 INIT = "sgd_step/init.caffemodel"
@@ -205,54 +205,6 @@ def test_extract_refuses_unknown_blobs(run: Run) -> None:
 # What extract says
 
 
-def test_extract_prints_a_summary_of_three_lines(run: Run, images: Path) -> None:
-    result = run("extract", *IMAGES, "--images", images / "rgb", "--zooms", "1,0.5")
-    assert (result.status, result.err) == (0, "")
-    what, pixels, wrote = result.out.splitlines()
-    assert what == f"{NET}: feat of 3 images from walk/rgb"
-    scaled = '0 to 255, times 0.00390625 (transform_param of layer "pair_data")'
-    assert pixels == f"data (1 x 28 x 28): gray, {scaled}"
-    assert wrote.startswith("f.npz: features (3, 16), names (3,), zooms (2,); ")
-    assert wrote.endswith(" ms per image")
-
-
-@pytest.mark.parametrize(
-    ("param", "reported"),
-    [
-        ("mean_value: 128 scale: 0.0078125", ", minus 128, times 0.0078125"),
-        ("mean_value: 123 mean_value: 104 mean_value: 123", ", minus 123, 104, 123"),
-        ("mirror: true", ""),
-    ],
-)
-def test_extract_prints_the_preprocessing(run: Run, images: Path, param: str, reported: str) -> None:
-    Path("net.prototxt").write_text(
-        'layer { name: "in" type: "DummyData" top: "data" dummy_data_param { shape { dim: 1 dim: 3 dim: 9 dim: 9 } } '
-        f"transform_param {{ {param} }} }}"
-    )
-    words = ["--model", "net.prototxt", "--blob", "data", "--images", images / "rgb", "--out", "f.npz"]
-    pixels = run("extract", *words).out.splitlines()[1]
-    assert pixels == f'data (3 x 9 x 9): BGR, 0 to 255{reported} (transform_param of layer "in")'
-
-
-def test_extract_prints_the_number_of_records(run: Run) -> None:
-    result = run("extract", "--model", NET, "--weights", INIT, "--blob", "feat", "sim", "--out", "f.npz")
-    assert (result.status, result.err) == (0, "")
-    what, wrote = result.out.splitlines()
-    assert what == f"{NET}: feat, sim of 200 records"
-    assert wrote.startswith("f.npz: feat (200, 8), sim (200, 1), keys (200,); ")
-    assert wrote.endswith(" ms per record")
-
-
-def test_extract_can_show_caffes_log(run: Run, images: Path) -> None:
-    words = [*IMAGES, "--images", images / "rgb"]
-    quiet = run("extract", *words)
-    for option in ("-v", "--verbose"):
-        loud = run("extract", option, *words)
-        assert "Network initialization done." in loud.messages
-        assert "Creating Layer conv1" in loud.messages
-        assert loud.out.splitlines()[:2] == quiet.out.splitlines()[:2]
-
-
 # Whether the pixels are those of the training
 
 INPUT = """
@@ -297,14 +249,6 @@ def test_weights_without_a_transform_get_no_warning(run: Run, images: Path) -> N
     for weights in ("deploy.caffemodel", "deploy.caffemodel.h5"):
         netspec.save_weights(net, weights)
         assert conv1_of(run, "deploy.prototxt", weights)[1].err == ""
-
-
-@pytest.mark.slow
-def test_the_shipped_net_gets_no_warning(run: Run, images: Path) -> None:
-    words = ROOT / "prototxt" / "many_negatives" / "siamese_words_256"
-    _, result = conv1_of(run, str(words / "deploy.prototxt"), str(words / "siamese_words_256.caffemodel"))
-    assert result.err == ""
-    assert len(result.out.splitlines()) == 3
 
 
 # extract_features

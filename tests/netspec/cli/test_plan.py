@@ -1,10 +1,8 @@
 """``netspec check --plan`` and ``--passes``."""
 
-import re
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 from paths import ROOT
@@ -34,13 +32,6 @@ def test_an_unknown_pass_is_refused(run: Callable[..., Any]) -> None:
 
 
 @pytest.mark.slow
-def test_a_training_net_has_no_passes(run: Callable[..., Any]) -> None:
-    out = run("check", DEPLOY, "--plan", "--phase", "TRAIN").out
-    assert "no passes" in out
-    assert re.search("bfloat16 on this CPU: (yes|no|unknown)\n", out)
-
-
-@pytest.mark.slow
 def test_the_plan_shows_how_a_net_is_trained(run: Callable[..., Any]) -> None:
     folder = DEPLOY.parents[1]
     shape = ("--shape", "pair_data=2,6,64,64")
@@ -49,14 +40,3 @@ def test_the_plan_shows_how_a_net_is_trained(run: Callable[..., Any]) -> None:
         assert said in run("check", net, "--plan", "--phase", "TRAIN", *shape).out
     large = ("--shape", "pair_data=8,6,224,224")
     assert "more than 4,194,304" in run("check", net, "--plan", "--phase", "TRAIN", *large).out
-
-
-def test_extract_accepts_passes(run: Callable[..., Any]) -> None:
-    files = "--model sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel"
-    words = f"extract {files} --blob feat --iterations 1".split()
-    found = []
-    for passes in ("none", "fold,pack"):
-        result = run(*words, "--out", "f.npz", "--passes", passes)
-        assert result.status == 0, result.err
-        found.append(np.load("f.npz")["feat"])
-    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5)

@@ -4,31 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from netspec.cli.scores import Score, Scores, Snapshot, read_scores
+from netspec.cli.scores import Score, Scores, read_scores
 from netspec.errors import SpecError
-
-SCORES = Scores(
-    [Score(0, 0, {"loss": [0.5], "accuracy": [0.1, 0.2]}), Score(5, 0, {"loss": [0.25]}), Score(5, 1, {"loss": [1.0]})],
-    [Snapshot(5, "a/b_iter_5.caffemodel"), Snapshot(8, "a/b_iter_8.caffemodel")],
-)
-
-
-def test_written_files_can_be_read(tmp_path: Path) -> None:
-    SCORES.write(tmp_path / "scores.json")
-    assert read_scores(tmp_path / "scores.json") == SCORES
-    assert [path.name for path in tmp_path.iterdir()] == ["scores.json"]
 
 
 def test_values_that_are_no_numbers_are_kept(tmp_path: Path) -> None:
     Scores([Score(3, 0, {"loss": [float("inf"), float("nan")]})]).write(tmp_path / "scores.json")
     (test,) = read_scores(tmp_path / "scores.json").tests
     assert [str(value) for value in test.outputs["loss"]] == ["inf", "nan"]
-
-
-def test_a_resumed_training_keeps_the_earlier_scores() -> None:
-    assert SCORES.before(5) == Scores(SCORES.tests[:1], SCORES.snapshots[:1])  # it will test at 5 once more
-    assert SCORES.before(6) == Scores(SCORES.tests, SCORES.snapshots[:1])
-    assert SCORES.before(0) == Scores([], [])
 
 
 @pytest.mark.parametrize(

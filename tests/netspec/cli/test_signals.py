@@ -158,23 +158,6 @@ def test_a_training_works_with_closed_stderr(work_in: Callable[..., Path]) -> No
     assert Path("sgd_step/ref_iter_60.solverstate.extra").is_file()
 
 
-ENDLESS = (Path(__file__).parent / "programs" / "endless.py").read_text()
-
-
-def test_a_second_interrupt_ends_a_training_immediately(endless) -> None:
-    """The first one waits for the end of the iteration, which never comes here."""
-    Path("endless.py").write_text(ENDLESS)
-    net = 'layer { name: "e" type: "Python" top: "e" python_param { module: "endless" layer: "Endless" } }'
-    Path(SOLVER).write_text(f"net_param {{ {net} }} base_lr: 1 lr_policy: 'fixed' max_iter: 1 snapshot_prefix: 'x'")
-    training = endless("--allow-python-layers")
-    training.wait_for("begun")
-    training.send(signal.SIGINT)
-    time.sleep(0.5)
-    assert not training.is_over()
-    training.send(signal.SIGINT)
-    assert training.status() == 130
-
-
 def test_on_a_terminal_a_line_shows_the_progress(work_in: Callable[..., Path]) -> None:
     work_in("train/sgd_step")
     pty, fcntl, termios = map(pytest.importorskip, ("pty", "fcntl", "termios"))  # Windows has none of them

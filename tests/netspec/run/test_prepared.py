@@ -1,8 +1,6 @@
 """Runs without gradients: prepared, folded and fused, they give the results of a layer-by-layer run after any write."""
 
 import copy
-import subprocess
-import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -30,7 +28,6 @@ from netspec.proto.schema import TRAIN, LayerParameter
 FILLERS = 'weight_filler { type: "gaussian" std: 0.2 } bias_filler { type: "uniform" min: -1 max: 1 }'
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 1 dim: 8 dim: 40 dim: 40 } } }'
 CONV = f'type: "Convolution" convolution_param {{ num_output: 16 kernel_size: 3 pad: 1 {FILLERS} }}'
-PRODUCT = f'type: "InnerProduct" inner_product_param {{ num_output: 6 {FILLERS} }}'
 NORM = """
 layer { name: "bn" type: "BatchNorm" bottom: "conv" top: "bn" }
 layer { name: "scale" type: "Scale" bottom: "bn" top: "scale" scale_param { bias_term: true } }
@@ -257,15 +254,6 @@ def test_sequences_are_kept_for_earlier_shapes(exact: str, net_of: Callable[...,
     assert "as is" not in {kind for sequence in before for kind in sequence.kinds}
 
 
-def test_the_number_of_sequences_is_limited(net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prepared, "MOST_SEQUENCES", 2)
-    net = trained(net_of(BLOCK))
-    for size in (7, 8, 9, 7):
-        assert_same(quickly(net, data=images(1, 8, size, size)), slowly(net, data=images(1, 8, size, size)))
-    assert net.prepared is not None
-    assert len(net.prepared.sequences) == 2
-
-
 @pytest.mark.parametrize(("runs", "fewest", "most"), [(prepared.MEMORY_FACTOR, 2, 16), (0, 1, 1)])
 def test_the_memory_of_sequences_is_limited(
     runs: int, fewest: int, most: int, net_of: Callable[..., Net], monkeypatch: pytest.MonkeyPatch
@@ -282,45 +270,6 @@ def test_the_memory_of_sequences_is_limited(
         assert set().union(*(sequence.memos for sequence in made)) == set(net.prepared.memos)
     assert fewest <= len(net.prepared.sequences) <= most
     assert_same(quickly(net, data=images(1, 8, 8, 9)), slowly(net, data=images(1, 8, 8, 9)))
-
-
-def test_exact_sequences_share_copies_of_blobs_and_count_their_memory(net_of: Callable[..., Net]) -> None:
-    net = trained(net_of(BLOCK, exact="all"))
-    assert net.prepared is not None
-    for size in range(8, 40):
-        quickly(net, data=images(1, 8, size, size))
-    made = net.prepared.sequences.values()
-    assert net.prepared.memos.keys() == next(iter(made)).memos
-    assert min(sequence.kept_bytes for sequence in made) > 0
-    learned = sum(item.parameter.nbytes for item in net.learnable)
-    needed = max(sequence.needed_bytes for sequence in made)
-    assert net.prepared.kept_bytes() <= prepared.MEMORY_FACTOR * (learned + needed)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_runs_of_many_sizes_need_little_more_memory_than_one(tmp_path: Path) -> None:
-    """Six small convolutions, 24 batch sizes: the process grows by a few runs of the largest."""
-    text = 'layer { name: "c0" type: "Input" top: "c0" input_param { shape { dim: 1 dim: 32 dim: 40 dim: 40 } } }'
-    for k in range(6):
-        text += f"""layer {{ name: "c{k + 1}" type: "Convolution" bottom: "c{k}" top: "c{k + 1}"
-            convolution_param {{ num_output: 32 kernel_size: 3 pad: 1 weight_filler {{ type: "xavier" }} }} }}"""
-    path = tmp_path / "net.prototxt"
-    path.write_text(text)
-    sequence = f"""if True:
-        import os, torch, netspec
-        from pathlib import Path
-        torch.set_num_threads(1)
-        net = netspec.load_net({str(path)!r}, seed=0)
-        grown = []
-        for size in range(1, 71, 3):
-            with torch.no_grad():
-                net(c0=torch.ones(size, 32, 40, 40))
-            grown.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
-        print(max(grown) - grown[0])"""
-    reported = subprocess.run([sys.executable, "-c", sequence], capture_output=True, text=True, timeout=300, check=True)
-    one_run = 3 * 4 * 70 * 32 * 40 * 40  # bytes: the input, a bottom and a top
-    assert int(reported.stdout) < 3 * one_run
 
 
 def test_nets_that_train_are_not_prepared(net_of: Callable[..., Net]) -> None:
