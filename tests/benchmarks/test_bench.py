@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import netspec
-from benchmarks import case, environment, growth, whole
+from benchmarks import case, environment, whole
 from benchmarks.cli import WHOLE, main
 from benchmarks.detectors import ssd300
 from benchmarks.report import Row, table
@@ -46,12 +46,6 @@ def test_all_take_their_turn_in_every_round_in_either_order() -> None:
     found = measure([Clock("a", 0.1, turns), Clock("b", 0.2, turns)], 3, lambda k: None)
     assert turns == ["a", "b", "a", "b", "b", "a", "a", "b"]  # the first two say how many passes a turn has
     assert found == {"a": [(0.1, 0.2)] * 3, "b": [(0.2, 0.4)] * 3}
-
-
-def test_a_time_limit_leaves_three_rounds() -> None:
-    turns: list[str] = []
-    found = measure([Clock("a", 0.1, turns)], 9, lambda k: None, limit=0)
-    assert found == {"a": [(0.1, 0.2)] * 3}
 
 
 def test_a_ratio_is_that_of_times_in_the_same_round() -> None:
@@ -138,22 +132,6 @@ def test_what_cannot_run_is_reported_in_a_line(
     assert 'no training of "resnet51"' in capsys.readouterr().err
 
 
-def test_an_environment_that_cannot_be_installed_is_a_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(environment, "FOLDER", tmp_path / "bench")
-    monkeypatch.setattr(environment, "PACKAGES", ("--no-index", "no-such-package"))
-
-    def create(folder: Path, **_: object) -> None:
-        (folder / "bin").mkdir(parents=True)
-        (folder / "bin" / "python").write_text("#!/bin/sh\necho no such package >&2; exit 1\n")
-        (folder / "bin" / "python").chmod(0o755)
-
-    monkeypatch.setattr(environment.venv, "create", create)
-    assert main(["forward", "lenet", "--with", "opencv4", "--rounds", "1"]) == 1
-    assert capsys.readouterr().err.endswith("bench: cannot install the libraries to compare with: no such package\n")
-
-
 @pytest.mark.slow
 def test_growth_is_measured_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plot, out = tmp_path / "growth.png", tmp_path / "growth.json"
@@ -165,21 +143,6 @@ def test_growth_is_measured_kept_and_drawn(tmp_path: Path, capsys: pytest.Captur
     assert [row["layers"] for row in rows] == [12, 22]
     assert all(value >= 0 for row in rows for value in row.values())
     assert all(row["memory, MB"] > 10 for row in rows)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "size"), [("layers", 1002), ("frames", 30)])
-def test_each_kind_of_growth_has_its_figures(kind: str, size: int) -> None:
-    """In this process, which has torch already."""
-    found = growth.KINDS[kind].measure(size)
-    assert found
-    assert all(value >= 0 for value in found.values())
-
-
-@pytest.mark.slow
-def test_the_reason_why_growth_cannot_be_measured_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["growth", "frames", "0"]) == 1
-    assert "frames 0: " in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -55,15 +55,6 @@ def test_what_cannot_be_chosen_is_said(chosen: Callable[..., object]) -> None:
         chosen("aarch64", jetson=True)
 
 
-@pytest.mark.slow
-def test_usage(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "tools" / "install.py"), "--gpu"]
-    environment = {**os.environ, "VENV": str(tmp_path / "venv")}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (1, "usage: install.py [--cpu]\n")
-    assert not (tmp_path / "venv").exists()
-
-
 @pytest.mark.skipif(os.name == "nt", reason="needs bash and the programs of .venv/bin")
 def test_what_a_script_needs_is_not_what_its_programs_need(tmp_path: Path) -> None:
     (tmp_path / "bin").mkdir()

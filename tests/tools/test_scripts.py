@@ -54,22 +54,13 @@ def test_a_script_uses_the_python_of_the_virtual_environment(script: str, projec
     assert done.stdout.startswith("usage: ")
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_without_one_a_message_names_the_command_to_run(script: str, project: Path, bare_python: Path) -> None:
-    done = run(project, bare_python, script, "--help")
+def test_without_one_a_message_names_the_command_to_run(project: Path, bare_python: Path) -> None:
+    done = run(project, bare_python, "train.py", "--help")
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"{project}/tools/{script}: ")
+    assert line.startswith(f"{project}/tools/train.py: ")
     assert "No module named " in line
     assert line.endswith(f"to install the required packages: {bare_python} {project}/tools/install.py")
-
-
-def test_a_virtual_environment_without_the_packages_is_tried_only_once(project: Path, bare_python: Path) -> None:
-    (project / ".venv").symlink_to(bare_python.parents[1])
-    for python in (bare_python, project / ".venv" / "bin" / "python"):
-        done = run(project, python, "convert_pairs_lmdb", "--help")
-        assert done.returncode == 1
-        assert len(done.stderr.splitlines()) == 1
 
 
 def test_arguments_and_the_exit_status_are_passed_on(project: Path, bare_python: Path) -> None:

@@ -1,6 +1,5 @@
 """The commands, called as ``netspec`` calls them: effects, messages and exit status."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -224,46 +223,6 @@ def test_typos_are_reported_with_suggestions(run: Run, edited: Edit) -> None:
         'net.prototxt:47:3: layer "conv2" (Convolution): unknown bottom blob "pol1"; did you mean "pool1"? '
         "available: pair_data, sim, data, data_p, conv1, pool1"
     )
-
-
-@pytest.mark.parametrize(
-    ("kind", "says"),
-    [
-        ('"Data" data_param { backend: LMDB', 'database "gone" does not exist'),
-        ('"ImageData" image_data_param {', 'list file "gone" cannot be read: No such file or directory'),
-        ('"HDF5Data" hdf5_data_param {', 'list file "gone" cannot be read: No such file or directory'),
-    ],
-    ids=["database", "images", "hdf5"],
-)
-def test_a_missing_source_is_reported_before_the_log(run: Run, kind: str, says: str) -> None:
-    """Even if it is the last one, of the net that tests."""
-    Path("net.prototxt").write_text(
-        'layer { name: "a" type: "DummyData" top: "a" dummy_data_param { shape { dim: 1 dim: 2 } } }\n'
-        f'layer {{ name: "b" top: "b" top: "label" type: {kind} source: "gone" batch_size: 1 }} '
-        "include { phase: TEST } }\n"
-        'layer { name: "ip" type: "InnerProduct" bottom: "a" top: "ip" inner_product_param { num_output: 1 } }\n'
-        'layer { name: "loss" type: "EuclideanLoss" bottom: "ip" bottom: "ip" include { phase: TRAIN } }\n'
-    )
-    Path("solver.prototxt").write_text(
-        'net: "net.prototxt" base_lr: 0.1 lr_policy: "fixed" max_iter: 1 test_iter: 1 test_interval: 1 '
-        'snapshot_prefix: "p" solver_mode: CPU'
-    )
-    line = run("train", "solver.prototxt").err.rstrip("\n")
-    assert line.startswith("net.prototxt:2:")
-    assert line.endswith(f"{says}; relative paths start from {Path.cwd()}")
-    assert "\n" not in line
-
-
-def test_missing_and_invalid_weights_are_refused(run: Run) -> None:
-    missing = f"nowhere.caffemodel: cannot be read: No such file or directory; relative paths start from {os.getcwd()}"
-    assert run("train", SOLVER, "--weights", "nowhere.caffemodel").fault == missing
-    assert run("test", "--model", NET, "--weights", "nowhere.caffemodel").fault == missing
-    Path("broken.caffemodel").write_bytes(Path(INIT).read_bytes()[:1000])
-    assert run("test", "--model", NET, "--weights", "broken.caffemodel").fault.startswith("broken.caffemodel: ")
-    assert run("train", SOLVER, "--snapshot", "nowhere.solverstate").fault.startswith(
-        "nowhere.solverstate: cannot be read"
-    )
-    assert run("train", SOLVER, "--snapshot", INIT).fault.startswith(f"{INIT}: ")
 
 
 def test_a_net_with_inputs_cannot_be_trained(run: Run, edited: Edit) -> None:

@@ -170,17 +170,6 @@ def test_a_lock_that_a_killed_run_left_is_taken(tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_pipes_and_links_named_like_unfinished_files_are_not_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(package, "_swept", set())
-    os.mkfifo(tmp_path / ".x.01234567.unfinished")
-    (tmp_path / ".y.01234567.unfinished").symlink_to("nowhere")
-    with package.whole_file(tmp_path / "file") as unfinished:
-        unfinished.write_text("new")
-    assert len(list(tmp_path.iterdir())) == 3
-
-
 def test_mode_and_owner_of_what_is_replaced_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, link = tmp_path / "file", tmp_path / "link"
     path.touch()

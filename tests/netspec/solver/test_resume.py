@@ -376,27 +376,6 @@ def forged(state: Path, *path: str | int, value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        (["seed"], float("inf")),
-        (["seed"], "3"),
-        (["weights", "size"], 1e99),
-        (["state", "hash"], 7),
-        (["losses"], [10**400]),
-        (["losses", 0], [0.5]),
-        (["nets"], {}),
-        (["nets", 0], {"-1": {}}),
-        (["nets", 0], {"x": {}}),
-        (["settings"], []),
-        (["settings", "solver"], 3),
-    ],
-)
-def test_an_invalid_value_is_refused(state: Path, path: list[str | int], value: object) -> None:
-    forged(state, *path, value=value)
-    refused(state, DAMAGED)
-
-
-@pytest.mark.parametrize(
     ("remembered", "message"),
     [
         ({"iteration": []}, r"found a saved state with iteration \(tuple\), expected iteration \(int\)"),

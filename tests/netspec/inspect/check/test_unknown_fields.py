@@ -61,25 +61,6 @@ def test_errors_before_a_fatal_error_are_reported():
     assert lines("net.prototxt")[-1] == 'net.prototxt:1:14: expected ":" or "{" after "even", found "3"'
 
 
-def test_all_errors_of_a_solver_and_its_nets_are_reported():
-    Path("net.prototxt").write_text(INPUT + STRANGE)
-    Path("solver.prototxt").write_text('net: "net.prototxt"\nbase_lr: 1\n')
-    found = [line.partition(": ")[2] for line in lines("solver.prototxt")]
-    assert found == [
-        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid, multifixed",
-        'layer "s" (Strange): LayerParameter has no field "strange_param";' + OWN,
-        'layer "s" (Strange): unknown layer type "Strange"; `netspec layers` lists the known ones, '
-        "docs/layer.md shows how to add one with --plugin FILE.py",
-    ]
-    Path("solver.prototxt").write_text('fast: true\nnet: "net.prototxt"\nbase_lr: 1\nquick_mode { x: 1 }\n')
-    assert [line.partition(": ")[2] for line in lines("solver.prototxt")] == [
-        'SolverParameter has no field "fast"',
-        'SolverParameter has no field "quick_mode"',
-        "no lr_policy, expected one of fixed, step, exp, inv, multistep, poly, sigmoid, multifixed",
-        *found[1:],
-    ]
-
-
 def test_an_unknown_field_hides_no_other_errors():
     """Errors in the same layer that may follow from it are not reported: here, that kernel_size is missing."""
     conv = (

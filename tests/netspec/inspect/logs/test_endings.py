@@ -123,22 +123,6 @@ def test_a_training_that_a_signal_stops(
     assert (stderr, file, result.status) == ("stopped early", "stopped early", 130)
 
 
-def test_lines_without_a_prefix_in_the_middle_are_no_end() -> None:
-    """A Python layer prints what it likes, and a resumed training continues in the same file."""
-    reader = LogReader("log")
-    lines = [
-        "I0101 00:00:01.000000 1 solver.cpp:239] Iteration 0, loss = 1",
-        "epoch: 3",
-        "I0101 00:00:02.000000 1 solver.cpp:239] Iteration 1, loss = 1",
-    ]
-    for line in lines:
-        reader.feed(line)
-    assert reader.log.state == "running"
-    for line in (*lines, "I0101 00:00:03.000000 1 solver.cpp:332] Optimization Done.", "real: 3 s"):
-        reader.feed(line)
-    assert reader.log.state == "done"
-
-
 def test_the_stack_trace_below_a_failed_check_of_caffe_changes_nothing() -> None:
     reader = LogReader("log")
     for line in (
