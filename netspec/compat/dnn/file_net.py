@@ -115,10 +115,6 @@ class FileNet:
         assert self.files is not None
         return len(self.declared if entry.name == INPUT else self.files.net.layer[entry.layer].top)
 
-    def node(self, net: CaffeNet, entry: Entry) -> Any:
-        """Return the node of a layer."""
-        return net.plan.nodes[self.nodes[entry.layer]]
-
     def layer(self, net: CaffeNet, entry: Entry) -> CaffeLayer:
         """Return netspec's layer for one of OpenCV's layers."""
         return net.layers[self.nodes[entry.layer]]

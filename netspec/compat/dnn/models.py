@@ -71,7 +71,7 @@ class Model:
         return self
 
     def setPreferableBackend(self, backendId: int) -> Model:
-        """Accept and ignore a backend."""
+        """Choose what runs the net, as :meth:`netspec.compat.dnn.net.Net.setPreferableBackend` does."""
         self._net.setPreferableBackend(backendId)
         return self
 

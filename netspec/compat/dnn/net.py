@@ -30,9 +30,13 @@ if TYPE_CHECKING:
 Array = np.ndarray
 INFERENCE_ENGINE, CUDA = 2, 5  # DNN_BACKEND_...
 BIASED = ("Convolution", "Deconvolution", "InnerProduct", "Scale")
-AS_WRITTEN = "{} cannot change a net of Caffe's files; write the layer into the prototxt"
-PICTURE = "{} is not supported; netspec draw shows the layers, shapes and connections"
-COSTS = "{} is not supported; netspec check shows multiply-adds and memory"
+INSTEAD = {  # of methods of OpenCV's net that are refused
+    "addLayer addLayerToPrev connect registerOutput": "write the layer into the prototxt",
+    "quantize getInputDetails getOutputDetails": "export the net to ONNX (netspec export) and quantize that",
+    "dump dumpToFile": "netspec draw shows the layers, shapes and connections",
+    "getFLOPS getMemoryConsumption": "netspec check shows multiply-adds and memory",
+    "forwardAsync": "use forward",
+}
 
 
 class Layer:
@@ -65,15 +69,6 @@ class Layer:
             return 0
         inputs = list(self._net._caffe.shown.values())
         return inputs.index(outputName) if outputName in inputs else -1
-
-
-def _refused(func: str, message: str, code: int = NOT_IMPLEMENTED) -> Callable[..., NoReturn]:
-    """Return a method that raises an error for any arguments."""
-
-    def refuse(self: Net, *arguments: Any, **named: Any) -> NoReturn:
-        raise DnnError(message.format(func), self._caffe.where(), code, func)
-
-    return refuse
 
 
 class Net:
@@ -309,7 +304,7 @@ class Net:
     def _value(self, net: CaffeNet, entry: Entry, top: int, func: str) -> int:
         if top < 0:
             raise DnnError(f'layer "{entry.name}" ({entry.type}) has no top', code=NOT_FOUND, func=func)
-        return self._caffe.node(net, entry).tops[top]
+        return net.plan.nodes[self._caffe.nodes[entry.layer]].tops[top]
 
     def _compute(self, net: CaffeNet, wanted: Sequence[int]) -> Mapping[int, torch.Tensor]:
         """Return the values with these numbers, from the whole net, or layer by layer up to the last one needed."""
@@ -339,7 +334,7 @@ class Net:
         walk([step for step in net.eager.one_by_one() if step.node <= end], values, net.options.exact, visit)
         return values
 
-    # The engine, settings without effect, and unsupported methods
+    # The engine, and settings without effect
 
     def setPreferableBackend(self, backendId: int) -> None:
         """Run the net with OpenVINO (INFERENCE_ENGINE), with PyTorch on a GPU (CUDA), or else with the default engine.
@@ -364,22 +359,6 @@ class Net:
 
     setPreferableTarget = enableFusion = enableWinograd = setHalideScheduler = _accept
 
-    addLayer = _refused("addLayer", AS_WRITTEN)
-    addLayerToPrev = _refused("addLayerToPrev", AS_WRITTEN)
-    connect = _refused("connect", AS_WRITTEN)
-    registerOutput = _refused("registerOutput", AS_WRITTEN)
-    quantize = _refused(
-        "quantize",
-        "quantizing Caffe nets is not supported; export the net to ONNX (netspec export) and quantize that",
-    )
-    dump = _refused("dump", PICTURE)
-    dumpToFile = _refused("dumpToFile", PICTURE)
-    getFLOPS = _refused("getFLOPS", COSTS)
-    getMemoryConsumption = _refused("getMemoryConsumption", COSTS)
-    forwardAsync = _refused("forwardAsync", "forwardAsync is not supported; use forward")
-    getInputDetails = _refused("getInputDetails", "the net is not quantized", UNSPECIFIED)
-    getOutputDetails = _refused("getOutputDetails", "the net is not quantized", UNSPECIFIED)
-
     # Errors
 
     def _input(self, name: str, func: str) -> str:
@@ -387,18 +366,17 @@ class Net:
         for blob, shown in self._caffe.shown.items():
             if name in ("", shown):
                 return blob
-        found = f'no input "{name}" in this net' if name else "this net has no inputs"
-        known = ", ".join(self._caffe.shown.values()) or "none"
-        raise DnnError(f"{found}; its inputs: {known}", self._caffe.where(), NOT_FOUND, func)
+        raise self._fault(f'no input "{name}"', func, NOT_FOUND)
 
     def _check_inputs(self, func: str) -> None:
         self._caffe.check_not_empty(func)
         for blob, shown in self._caffe.shown.items():
             if blob not in self._caffe.values:
-                known = ", ".join(self._caffe.shown.values())
-                raise DnnError(
-                    f'no value for input "{shown}"; this net\'s inputs: {known}', self._caffe.where(), func=func
-                )
+                raise self._fault(f'no value for input "{shown}"', func)
+
+    def _fault(self, found: str, func: str, code: int = UNSPECIFIED) -> DnnError:
+        known = ", ".join(self._caffe.shown.values()) or "none"
+        return DnnError(f"{found}; this net's inputs: {known}", self._caffe.where(), code, func)
 
     def _with_shapes(self, fault: ValueError, func: str) -> DnnError:
         """Return an error of a run, with the shapes of the inputs that differ from the prototxt."""
@@ -410,6 +388,20 @@ class Net:
         ]
         message = "; ".join([getattr(fault, "message", str(fault)), *changed])
         return DnnError(message, getattr(fault, "where", None), BAD_ARGUMENT, func)
+
+
+def _refused(func: str, instead: str) -> Callable[..., NoReturn]:
+    """Return a method that raises an error for any arguments."""
+
+    def refuse(self: Net, *arguments: Any, **named: Any) -> NoReturn:
+        raise DnnError(f"{func} is not supported; {instead}", self._caffe.where(), NOT_IMPLEMENTED, func)
+
+    return refuse
+
+
+for _names, _instead in INSTEAD.items():
+    for _name in _names.split():
+        setattr(Net, _name, _refused(_name, _instead))
 
 
 def _normalized(values: Array, scale: float, mean: Array) -> Array:
