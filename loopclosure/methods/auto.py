@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from loopclosure.methods.base import Images, Method, MethodContext, MethodResult
 from loopclosure.methods.drive import Drive, Request, speeds_between
 from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
-from loopclosure.places.pose_files import read_poses
+from loopclosure.places.sequences import PoseChoice, with_odometry
 from loopclosure.progress import Progress, timed
 
 
@@ -52,9 +53,9 @@ class Auto:
         seconds, queries, two = dict(found.seconds), images.queries, images.references is not None
         if self.odometry and two:
             raise InputError("odometry is that of one sequence; these are queries and references", self.odometry)
-        poses = read_poses(self.odometry) if self.odometry else None
-        path = poses and poses.of_images(len(queries), queries.stamps, self.odometry)
-        request = Request(self.precision, None if self.visit < 0 else self.visit, odometry=path)
+        if self.odometry:
+            queries = with_odometry(queries, PoseChoice(Path(self.odometry)))
+        request = Request(self.precision, None if self.visit < 0 else self.visit, odometry=queries.odometry)
         own = np.full((len(queries), len(queries)), np.nan, np.float32) if two else found.scores
         drive = Drive(
             len(queries),

@@ -88,7 +88,7 @@ class _WordMethod:
 
 @dataclass
 class FabMapMethod(_WordMethod):
-    """FAB-MAP 2.0; the score is the posterior probability of the place."""
+    """FAB-MAP 2.0; the score is the log of the posterior odds of the place against a new place."""
 
     settings: FabMapSettings = field(default_factory=FabMapSettings)
     name: str = "fabmap"
@@ -97,7 +97,7 @@ class FabMapMethod(_WordMethod):
     def _compared(self, model: WordModel, queries: np.ndarray, references: np.ndarray | None) -> tuple[np.ndarray, str]:
         fabmap = FabMapModel(model.tree, model.training_words, self.settings)
         found = score_sequence(fabmap, queries) if references is None else score_sets(fabmap, queries, references)
-        return found.posterior, f"FAB-MAP 2.0, score: posterior; {self.settings}"
+        return found.log_odds, f"FAB-MAP 2.0, score: log odds against a new place; {self.settings}"
 
 
 @dataclass

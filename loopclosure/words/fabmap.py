@@ -115,20 +115,18 @@ class PlaceScores:
 
     posterior  (Q, P) probabilities
     new        (Q,) probability of a new place
+    log_odds   (Q, P) ln p(place | image) / p(new place | image): of one image in the order of the posterior, but never
+               0 or 1, and not shared among the places that show the same
     """
 
     posterior: np.ndarray
     new: np.ndarray
+    log_odds: np.ndarray
 
 
 def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> PlaceScores:
     """Score queries with words (Q, v) on a map of places with words (P, v), for two traverses."""
-    loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries)
-    posterior, new = np.empty_like(loglik), np.empty(len(loglik))
-    for i in range(len(loglik)):
-        found = model.posterior(loglik[i], loglik_new[i])
-        new[i], posterior[i] = found[0], found[1:]
-    return PlaceScores(posterior, new)
+    return _scored(model, queries, places, np.full(len(queries), len(places)))
 
 
 def score_sequence(model: FabMapModel, words: np.ndarray) -> PlaceScores:
@@ -136,10 +134,15 @@ def score_sequence(model: FabMapModel, words: np.ndarray) -> PlaceScores:
 
     The upper triangle with the diagonal is NaN, and so are images that are too recent to be on the map.
     """
-    loglik, loglik_new = model.likelihoods(words, words), model.new_place(words)
+    return _scored(model, words, words, np.maximum(0, np.arange(len(words)) - model.settings.recent))
+
+
+def _scored(model: FabMapModel, queries: np.ndarray, places: np.ndarray, known: np.ndarray) -> PlaceScores:
+    """Score each query on the map of the first ``known`` (Q,) places; NaN for the others."""
+    loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries)
+    loglik[np.arange(loglik.shape[1]) >= known[:, None]] = np.nan
     posterior, new = np.full_like(loglik, np.nan), np.empty(len(loglik))
-    for i in range(len(loglik)):
-        places = max(0, i - model.settings.recent)
-        found = model.posterior(loglik[i, :places], loglik_new[i])
-        new[i], posterior[i, :places] = found[0], found[1:]
-    return PlaceScores(posterior, new)
+    for i, count in enumerate(known):
+        found = model.posterior(loglik[i, :count], loglik_new[i])
+        new[i], posterior[i, :count] = found[0], found[1:]
+    return PlaceScores(posterior, new, loglik - loglik_new[:, None])

@@ -1,16 +1,23 @@
 """The one decision: what sequences, decoys and points decide, at once and frame by frame, on drives of known truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from given_scores import GivenScores
 from loopclosure.decision.constants import ALIKE, PRECISION, SURE, SURE_AMONG_ALIKE
 from loopclosure.decision.decider import Decider, Decision, Settings
 from loopclosure.decision.lines import HALF
 from loopclosure.decision.points import look_alike, too_few, wrong_share
 from loopclosure.decision.visits import Usual, Visits, far_apart, outstanding
-from loopclosure.detector.verification import Agreement, GeometricCheck
+from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures, Pairs
 from loopclosure.errors import InputError
+from loopclosure.methods.auto import Auto
+from loopclosure.methods.base import Images
 from loopclosure.methods.drive import USUAL, Drive, Request, speeds_between
+from loopclosure.places.image_sequence import ImageSequence
+from loopclosure.progress import silent
 from paths import shared
 
 SIZE = 64
@@ -208,6 +215,23 @@ def test_frames_far_apart_by_odometry_are_no_candidates():
     assert far[:12].all()
     assert not far[12]
     assert not far[25:].any()
+
+
+def test_odometry_of_auto_is_interpolated(tmp_path):
+    """Two laps are alike; by odometry of 5 Hz, with images between its poses, they are two floors."""
+    rows = np.concatenate([drive(80, 3), again(drive(80, 3), 0.3, 4)])
+    stamps = 0.2 * (np.arange(len(rows)) + 0.5)
+    path = np.array([[0.2 * t, t, 0, 0, 0, 0, 0, 1] for t in range(len(rows) + 1)], float)
+    np.savetxt(tmp_path / "odometry.txt", path)
+    files = [tmp_path / f"{number}.png" for number in range(len(rows))]
+    images = Images(replace(ImageSequence.of_files(files), stamps=stamps))
+    pairs = Pairs(lambda path: LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)))
+    counts = []
+    for odometry in ("", str(tmp_path / "odometry.txt")):
+        method = Auto(GivenScores(rows @ rows.T), odometry=odometry, pairs=pairs)
+        counts.append(np.count_nonzero(np.isfinite(method.score(images, silent).scores)))
+    assert counts[0] > 40
+    assert counts[1] == 0
 
 
 def test_visits_end_when_two_frames_in_a_row_differ():

@@ -119,6 +119,10 @@ def test_the_second_lap_finds_the_first() -> None:
     earlier = np.nan_to_num(scores.posterior)
     np.testing.assert_allclose(earlier.sum(axis=1) + scores.new, 1.0, atol=1e-12)
     assert np.mean(np.argmax(earlier[30:], axis=1) == np.arange(30)) > 0.8
+    smoothed = 0.01 / (1 + np.maximum(0, np.arange(60) - 4))
+    odds = (earlier - smoothed[:, None]) / (scores.new - smoothed)[:, None]
+    there = earlier > smoothed[:, None] + 1e-9
+    np.testing.assert_allclose(scores.log_odds[there], np.log(odds[there]), atol=1e-4)
 
 
 @pytest.mark.parametrize(
