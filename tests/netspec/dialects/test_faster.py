@@ -20,7 +20,6 @@ from netspec.layers import Layer
 from netspec.net.build import build_net
 from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
-from paths import ROOT
 
 Build = Callable[..., Layer]
 
@@ -273,28 +272,3 @@ def test_a_saved_order_of_other_images_is_refused(tmp_path: Path, waiting: str) 
     with pytest.raises(SpecError, match=f'found images "{waiting}" to read next, expected numbers below 3'):
         layer.restore({"waiting": waiting})
     assert layer.running_state() == {"waiting": ""}
-
-
-@pytest.mark.slow
-def test_the_losses_of_a_small_faster_rcnn_fall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faster, "SHORTEST", 240)  # the fork's 600 would take ten times as long
-    monkeypatch.chdir(tmp_path)
-    rng = np.random.default_rng(5)
-    entries = []
-    for i in range(5):
-        image = rng.integers(90, 130, (120, 160, 3)).astype(np.uint8)
-        x, y, kind = int(rng.integers(5, 80)), int(rng.integers(5, 50)), 1 + i % 2
-        image[y : y + 60, x : x + 60] = (240, 30, 30) if kind == 1 else (30, 30, 240)
-        cv2.imwrite(f"{i}.png", image)
-        entries.append({"image": f"{i}.png", "boxes": [[x, y, x + 59, y + 59]], "gt_classes": [kind]})
-    Path("solver.prototxt").write_text(
-        f'train_net: "{ROOT}/examples/faster_rcnn.prototxt" base_lr: 0.001 lr_policy: "fixed" momentum: 0.9\n'
-        "random_seed: 3 snapshot_after_train: false"
-    )
-    solver = netspec.load_solver("solver.prototxt")
-    solver.net.layers[0].set_roidb(entries)
-    losses = []
-    for _ in range(80):
-        solver.step(1)
-        losses.append(solver.loss)
-    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])

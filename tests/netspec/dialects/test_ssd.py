@@ -17,11 +17,9 @@ from netspec.layers import Layer
 from netspec.load import load_solver
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.proto.schema import TEST, TRAIN
 from netspec.proto.text import parse_net_text
 
 Build = Callable[..., Layer]
-Box = tuple[float, float, float, float]
 
 
 # ---- Permute, Normalize ----
@@ -104,14 +102,6 @@ def test_prior_box_warns_of_sizes_cut_to_whole_pixels(build: Build, caplog: pyte
 # ---- DetectionOutput ----
 
 
-def overlap(a: Box, b: Box) -> float:
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    if width <= 0 or height <= 0:
-        return 0.0
-    union = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - width * height
-    return width * height / union
-
-
 def test_detection_output_with_the_variance_encoded_in_the_target(build: Build) -> None:
     settings = (
         "num_classes: 2 variance_encoded_in_target: true confidence_threshold: 0.5 nms_param { nms_threshold: 0 }"
@@ -136,72 +126,6 @@ def test_unsupported_fields_of_detection_output_get_a_warning(caplog: pytest.Log
 
 
 # ---- A detector ----
-
-NET = """
-  layer { name: 'in' type: 'Input' top: 'data' input_param { shape { dim: 2 dim: 3 dim: 64 dim: 64 } } }
-  layer { name: 'conv' type: 'Convolution' bottom: 'data' top: 'conv'
-          convolution_param { num_output: 8 kernel_size: 16 stride: 16 weight_filler { type: 'xavier' } } }
-  layer { name: 'norm' type: 'Normalize' bottom: 'conv' top: 'norm'
-          norm_param { across_spatial: false channel_shared: false scale_filler { type: 'constant' value: 20 } } }
-  layer { name: 'loc' type: 'Convolution' bottom: 'norm' top: 'loc'
-          convolution_param { num_output: 16 kernel_size: 3 pad: 1 weight_filler { type: 'xavier' } } }
-  layer { name: 'loc_perm' type: 'Permute' bottom: 'loc' top: 'loc_perm'
-          permute_param { order: 0 order: 2 order: 3 order: 1 } }
-  layer { name: 'loc_flat' type: 'Flatten' bottom: 'loc_perm' top: 'loc_flat' }
-  layer { name: 'conf' type: 'Convolution' bottom: 'norm' top: 'conf'
-          convolution_param { num_output: 12 kernel_size: 3 pad: 1 weight_filler { type: 'xavier' } } }
-  layer { name: 'conf_perm' type: 'Permute' bottom: 'conf' top: 'conf_perm'
-          permute_param { order: 0 order: 2 order: 3 order: 1 } }
-  layer { name: 'conf_flat' type: 'Flatten' bottom: 'conf_perm' top: 'conf_flat' }
-  layer { name: 'prior' type: 'PriorBox' bottom: 'norm' bottom: 'data' top: 'prior'
-          prior_box_param { min_size: 20 max_size: 40 aspect_ratio: 2
-                            variance: 0.1 variance: 0.1 variance: 0.2 variance: 0.2 } }
-  layer { name: 'conf_reshape' type: 'Reshape' bottom: 'conf_flat' top: 'conf_reshape'
-          reshape_param { shape { dim: 0 dim: -1 dim: 3 } } include { phase: TEST } }
-  layer { name: 'prob' type: 'Softmax' bottom: 'conf_reshape' top: 'prob' softmax_param { axis: 2 }
-          include { phase: TEST } }
-  layer { name: 'prob_flat' type: 'Flatten' bottom: 'prob' top: 'prob_flat' include { phase: TEST } }
-  layer { name: 'out' type: 'DetectionOutput' bottom: 'loc_flat' bottom: 'prob_flat' bottom: 'prior' top: 'out'
-          include { phase: TEST }
-          detection_output_param { num_classes: 3 nms_param { nms_threshold: 0.45 top_k: 400 } code_type: CENTER_SIZE
-                                   keep_top_k: 20 confidence_threshold: 0.01 } }
-  layer { name: 'label' type: 'Input' top: 'label' input_param { shape { dim: 1 dim: 1 dim: 2 dim: 8 } }
-          include { phase: TRAIN } }
-  layer { name: 'loss' type: 'MultiBoxLoss' bottom: 'loc_flat' bottom: 'conf_flat' bottom: 'prior' bottom: 'label'
-          top: 'loss' include { phase: TRAIN }
-          multibox_loss_param { num_classes: 3 code_type: CENTER_SIZE } }
-"""
-
-
-@pytest.mark.slow
-def test_a_small_detector_learns_where_two_squares_are() -> None:
-    use_dialect("ssd")
-    net, source = parse_net_text(NET, "f")
-    net.state.phase = TRAIN
-    train = build_net(net, source, BuildOptions(seed=1))
-    net.state.phase = TEST
-    test = build_net(net, source, BuildOptions(seed=1))
-    image = torch.zeros(2, 3, 64, 64)
-    image[0, :, 10:40, 5:35] = 1
-    image[1, 1, 30:60, 30:50] = 1
-    truth = torch.tensor(
-        [[0, 1, 0, 5 / 64, 10 / 64, 35 / 64, 40 / 64, 0], [1, 2, 0, 30 / 64, 30 / 64, 50 / 64, 60 / 64, 0]]
-    ).reshape(1, 1, 2, 8)
-    optimizer = torch.optim.Adam([p.parameter for p in train.learnable], lr=0.01)
-    losses = []
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss, _ = train.forward_loss(data=image, label=truth)
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.1 * losses[0]
-    test.share_weights_with(train)
-    out = test(data=image)["out"][0, 0]
-    for i, row in enumerate(truth[0, 0]):
-        best = max(out[out[:, 0] == i], key=lambda found: float(found[2]))
-        assert best[1] == row[1]
-        assert overlap(tuple(best[3:].tolist()), tuple(row[3:7].tolist())) > 0.7
 
 
 def test_solver_fields_of_ssd_without_effect_get_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -129,7 +129,7 @@ def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net]) 
     head = """
     input: "data" input_shape { dim: 6 dim: 5 } input: "wanted" input_shape { dim: 6 dim: 3 }
     layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc"
-      inner_product_param { num_output: 3 weight_filler { type: "gaussian" std: 1 } } }
+      inner_product_param { num_output: 3 } }
     """
     own = head + (
         'layer { name: "loss" type: "Python" bottom: "fc" bottom: "wanted" top: "loss" loss_weight: 1 '
@@ -139,6 +139,7 @@ def test_a_python_loss_among_other_layers(python_net: Callable[..., caffe.Net]) 
     nets = [python_net(text, caffe.TRAIN) for text in (own, caffes)]
     nets[1].share_with(nets[0])
     random = np.random.default_rng(0)
+    nets[0].params["fc"][0].data[...] = random.normal(size=(3, 5))
     arrays: dict[str, Any] = {"data": random.random((6, 5)), "wanted": random.random((6, 3))}
     losses = [net.forward(**arrays)["loss"].reshape(()) for net in nets]
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
