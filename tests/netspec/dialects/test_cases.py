@@ -70,8 +70,5 @@ def test_invalid_fields_and_bottoms_are_refused_at_their_place(case: dict[str, s
     with pytest.raises(SpecError) as caught:
         make_layer(case["layer"], sizes(case["bottoms"]), where, int(case["tops"] or 1))
     fault = caught.value
-    assert (fault.where.file if fault.where else "", fault.code.name if fault.code else "") == (
-        case["field"],
-        case["code"],
-    )
+    assert (fault.where.file if fault.where else "") == case["field"]
     assert len(str(fault).splitlines()) == 1

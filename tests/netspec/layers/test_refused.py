@@ -26,6 +26,5 @@ def test_an_invalid_field_or_bottom_is_refused_at_its_place(case: dict[str, str]
             context(at=at, phase=TRAIN if case["phase"] else TEST),
             int(case["tops"] or 1),
         )
-    fault = caught.value
-    assert (str(fault.where or ""), fault.code.name if fault.code else "") == (case["field"], case["code"])
-    assert len(str(fault).splitlines()) == 1
+    assert str(caught.value.where or "") == case["field"]
+    assert len(str(caught.value).splitlines()) == 1
