@@ -18,7 +18,7 @@ from benchmarks import results
 from benchmarks.cache import Cache
 from benchmarks.pages import RESULTS
 from lmdb_build.walk.sequence import Walk, write_walk
-from loopclosure.evaluate import Outcome, judge
+from loopclosure.evaluation import Outcome, judge
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import DataSet, load_folder, load_place_pairs, load_sequence

@@ -24,15 +24,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
-from loopclosure import LoopDetector
-from loopclosure.closing.measure import CHECK
-from loopclosure.closing.online import Keyframes, LoopCloser
-from loopclosure.closing.synchronizer import Synchronizer
-from loopclosure.detector.run import load_describe
-from loopclosure.errors import InputError
-from loopclosure.places.messages import camera_of, image_of, is_rectified, pose_of, seconds
+from loopclosure import GeometricCheck, LoopCloser, LoopDetector, Synchronizer, messages
 
 DEFAULTS = {"describe": "default", "map": "map", "step": 0.1, "turn": 0.1, "recent": 10.0, "gap": 0.5, "kept": 1000}
+CHECK = GeometricCheck(max_features=1000, most_side=1_000_000)  # images are not reduced: poses are measured from points
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # who subscribes later gets the last message
 
 
@@ -46,7 +41,8 @@ class LoopClosure(Node):
         super().__init__("loopclosure")
         self.set = {name: self.declare_parameter(name, value).value for name, value in DEFAULTS.items()}
         self.mount = list(self.declare_parameter("mount", [0.0] * 7).value)  # no rotation: not given
-        self.describe, self.closer, self.shown = load_describe(self.set["describe"]), None, 0
+        limits = {"exclude_seconds": self.set["recent"], "in_memory": self.set["kept"]}
+        self.detector, self.closer, self.shown = LoopDetector(self.set["describe"], check=CHECK, **limits), None, 0
         self.warn, self.newest = self.get_logger().warning, queue.Queue(1)
         self.loops = self.create_publisher(PoseWithCovarianceStamped, "loops", 10)
         self.path = self.create_publisher(Path, "path", KEPT)
@@ -66,11 +62,11 @@ class LoopClosure(Node):
 
     def on_odometry(self, message):
         self.odom_frames = message.header.frame_id, message.child_frame_id
-        self.joined.odometry(seconds(message.header.stamp), pose_of(message))
+        self.joined.odometry(messages.seconds(message.header.stamp), messages.pose_of(message))
         self.join()
 
     def on_image(self, message):
-        self.joined.image(seconds(message.header.stamp), message)
+        self.joined.image(messages.seconds(message.header.stamp), message)
         self.join()
 
     def join(self):  # the newest image whose pose is known waits until the worker is ready
@@ -89,19 +85,17 @@ class LoopClosure(Node):
 
     def look(self, stamp, image, pose):
         self.closer = self.closer or self.begin(image)
-        for loop in self.closer.add(image_of(image), stamp, pose):
+        for loop in self.closer.add(messages.image_of(image), stamp, pose):
             self.tell_loop(loop)
 
     def begin(self, image):
-        rectified = is_rectified(self.resolve_topic_name("image"))
-        camera, mount = camera_of(self.camera, rectified), self.mount
+        rectified = messages.is_rectified(self.resolve_topic_name("image"))
+        camera, mount = messages.camera_of(self.camera, rectified), self.mount
         if camera is None:
-            raise InputError("camera_info has no calibration yet of a pinhole or fisheye camera")
+            raise ValueError("camera_info has no calibration yet of a pinhole or fisheye camera")
         if not any(mount[3:]):
-            mount = pose_of(self.buffer.lookup_transform(self.odom_frames[1], image.header.frame_id, Time()))
-        limits = {"exclude_seconds": self.set["recent"], "in_memory": self.set["kept"]}
-        detector = LoopDetector(self.describe, check=CHECK, **limits)
-        return LoopCloser(detector, camera, mount, Keyframes(self.set["step"], self.set["turn"]), self.warn).start()
+            mount = messages.pose_of(self.buffer.lookup_transform(self.odom_frames[1], image.header.frame_id, Time()))
+        return LoopCloser(self.detector, camera, mount, self.set["step"], self.set["turn"], self.warn).start()
 
     def stamped(self, kind, stamp):
         message = kind()

@@ -4,11 +4,11 @@ A true box is a row: kind (from 1), x1, y1, x2, y2 as fractions of the image. A 
 """
 
 import cv2
+import lmdb
 import numpy as np
 
 import netspec
 import netspec.pycaffe as caffe
-from netspec.data.database import Writer
 
 COLORS = ((255, 255, 255), (0, 0, 255), (0, 255, 255), (255, 128, 0))  # of true boxes, and of found ones by kind
 
@@ -33,7 +33,7 @@ def render(random, size=96):
 def write(path, images):
     """Write images with their boxes as a database for SSD's layer AnnotatedData."""
     netspec.use_dialect("ssd")
-    with Writer(path) as writer:
+    with lmdb.open(path, map_size=1 << 30) as database, database.begin(write=True) as writer:
         for i, (image, boxes) in enumerate(images):
             record = caffe.proto.caffe_pb2.AnnotatedDatum(type=0)
             record.datum.encoded, record.datum.data = True, cv2.imencode(".png", image)[1].tobytes()

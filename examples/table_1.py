@@ -1,4 +1,4 @@
-"""The paper's Table I on your own sequences: pairs, databases, trainings, and the table.
+"""The paper's Table I on your own sequences: pairs, databases, and the table of lmdb-build compare.
 
 python3 table_1.py --room desk_1 desk_2 --room kitchen --room hall_1 hall_2 --out table_1
 
@@ -9,31 +9,15 @@ or in a folder with a copy of the clone's folder prototxt. docs/paper.md has the
 """
 
 import argparse
-import json
 import os
 import shlex
 from importlib import import_module
 from pathlib import Path
 
-from loopclosure.report.table_one import PAPER, read_runs, summary
 from netspec.proto.text import read_net, read_solver, write_text
 
 NETS = ("siamese_8", "siamese_128", "siamese_resnet27_256", "siamese_resnet27_512")
 TEST_BATCH, GAP = 50, 1  # the least seconds between the images of a pair, and between training and other images
-
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--room", nargs="+", action="append", required=True, type=Path, metavar="SEQUENCE")
-parser.add_argument("--out", type=Path, default=Path("table_1"), help="folder for all files (%(default)s)")
-parser.add_argument("--nets", nargs="+", choices=NETS, default=NETS, help="the nets to train (all four)")
-parser.add_argument("--seeds", type=int, default=1, help="number of trainings of each net (%(default)s)")
-parser.add_argument("--leave-one-out", action="store_true", help="also train without each room in turn")
-parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (%(default)s)")
-parser.add_argument("--batch", type=int, default=32, help="pairs per iteration (%(default)s)")
-parser.add_argument("--iterations", type=int, default=3000, help="iterations of each training (%(default)s)")
-parser.add_argument("--train", type=int, default=6000, help="training pairs, at most (%(default)s)")
-parser.add_argument("--validation", type=int, default=1200, help="validation and test pairs, at most (%(default)s)")
-parser.add_argument("--gpu", help="number of the GPU (default: the CPU)")
-parser.add_argument("--precision", default="fp32", help="of the trainings: fp32, or bf16 where the machine has it")
 
 
 def run(*words: object) -> None:
@@ -61,13 +45,13 @@ def make_pairs(a: argparse.Namespace, rooms: list[list[Path]], out: Path, counts
             run("lmdb-build", "convert", *size, f"{root}/", out / f"{name}.txt", out / f"{name}_lmdb")
 
 
-def write_net(a: argparse.Namespace, name: str, pairs: Path, folder: Path, seed: int) -> Path:
-    """Write one of the paper's nets and its solver for these pairs; return the solver.
+def write_solvers(a: argparse.Namespace, name: str, pairs: Path, folder: Path) -> list[Path]:
+    """Write one of the paper's nets for these pairs, and a solver for each seed; return the solvers.
 
     The settings are the paper's; rates and BatchNorm's means are for the same shares of the training.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    source = Path("prototxt", "normalized", name)
+    source, solvers = Path("prototxt", "normalized", name), []
     net, solver = read_net(source / "train_val.prototxt"), read_solver(source / "solver.prototxt")
     train, validation = (layer.data_param for layer in net.layer if layer.type == "Data")
     train.source, train.batch_size = str(pairs / "train_lmdb"), a.batch
@@ -75,45 +59,50 @@ def write_net(a: argparse.Namespace, name: str, pairs: Path, folder: Path, seed:
     for layer in net.layer:
         if layer.type == "BatchNorm":
             layer.batch_norm_param.moving_average_fraction = max(0.9, 1 - 30 / a.iterations)
-    solver.net, solver.snapshot_prefix = str(folder / "train_val.prototxt"), str(folder / name)
+    (folder / "train_val.prototxt").write_text(write_text(net))
+    solver.net, solver.max_iter = str(folder / "train_val.prototxt"), a.iterations
     solver.test_iter[:], solver.stepsize = [-(-a.validation // TEST_BATCH)], max(1, a.iterations // 3)
     solver.test_interval = solver.snapshot = max(1, a.iterations // 6)
-    solver.max_iter, solver.random_seed, solver.solver_mode = a.iterations, seed, int(a.gpu is not None)
-    (folder / "train_val.prototxt").write_text(write_text(net))
-    (folder / "solver.prototxt").write_text(write_text(solver))
-    return folder / "solver.prototxt"
+    for seed in range(1, a.seeds + 1):
+        solvers.append(folder / f"seed_{seed}" / "solver.prototxt")
+        solvers[-1].parent.mkdir(exist_ok=True)
+        solver.random_seed, solver.solver_mode = seed, int(a.gpu is not None)
+        solver.snapshot_prefix = str(solvers[-1].with_name(name))
+        solvers[-1].write_text(write_text(solver))
+    return solvers
 
 
-def train(a: argparse.Namespace, pairs: Path, test: Path, out: Path) -> list[dict[str, object]]:
-    """Train each net with each seed on some pairs, and judge it on the validation and the test pairs: a row each."""
-    rows: list[dict[str, object]] = []
-    for net in a.nets:
-        files = [out / net / f"seed_{seed}" / "runs.json" for seed in range(1, a.seeds + 1)]
-        for seed, file in enumerate(files, 1):
-            if not file.exists():
-                solver = write_net(a, net, pairs, file.parent, seed)
-                words = ["--resume", "--precision", a.precision, "--test", test, *(["--gpu", a.gpu] if a.gpu else [])]
-                run("lmdb-build", "compare", solver, *words, "--out", file.parent)
-        rows.append({"net": net, "trained on": out.name.replace("_", " "), "paper": PAPER[NETS.index(net)][1]})
-        for judged in ("validation", "test"):
-            found = summary([read_runs(file, judged)[0] for file in files])
-            rows[-1] |= {f"{judged} {name}": text for name, text in found.items()}
-    return rows
+def compare(a: argparse.Namespace, pairs: Path, test: Path, out: Path) -> None:
+    """Train each net with each seed on some pairs, and judge it on the validation and the test pairs."""
+    if not (out / "table.csv").exists():
+        solvers = [solver for net in a.nets for solver in write_solvers(a, net, pairs, out / net)]
+        words = ["--resume", "--precision", a.precision, "--test", test, *(["--gpu", a.gpu] if a.gpu else [])]
+        run("lmdb-build", "compare", *solvers, *words, "--out", out)
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--room", nargs="+", action="append", required=True, type=Path, metavar="SEQUENCE")
+    parser.add_argument("--out", type=Path, default=Path("table_1"), help="folder for all files (%(default)s)")
+    parser.add_argument("--nets", nargs="+", choices=NETS, default=NETS, help="the nets to train (all four)")
+    parser.add_argument("--seeds", type=int, default=1, help="number of trainings of each net (%(default)s)")
+    parser.add_argument("--leave-one-out", action="store_true", help="also train without each room in turn")
+    parser.add_argument("--size", type=int, default=64, help="side of the images in pixels (%(default)s)")
+    parser.add_argument("--batch", type=int, default=32, help="pairs per iteration (%(default)s)")
+    parser.add_argument("--iterations", type=int, default=3000, help="iterations of each training (%(default)s)")
+    parser.add_argument("--train", type=int, default=6000, help="training pairs, at most (%(default)s)")
+    parser.add_argument("--validation", type=int, default=1200, help="validation and test pairs, at most (%(default)s)")
+    parser.add_argument("--gpu", help="number of the GPU (default: the CPU)")
+    parser.add_argument("--precision", default="fp32", help="of the trainings: fp32, or bf16 if the machine has it")
     a = parser.parse_args()
     counts = {"train": a.train, "val": a.validation, "test": a.validation}
     make_pairs(a, a.room, a.out / "pairs", counts)
-    rows = train(a, a.out / "pairs", a.out / "pairs" / "test_lmdb", a.out / "all_rooms")
+    compare(a, a.out / "pairs", a.out / "pairs" / "test_lmdb", a.out / "all_rooms")
     for left in a.room if a.leave_one_out else ():
         folder = a.out / f"without_{left[0].name}"
         make_pairs(a, [room for room in a.room if room is not left], folder / "pairs", {**counts, "test": 0})
         make_pairs(a, [left], folder / "test", {"train": 0, "val": 0, "test": a.validation})
-        rows += train(a, folder / "pairs", folder / "test" / "test_lmdb", folder)
-    (a.out / "table.json").write_text(json.dumps(rows, indent=1))
-    for row in (rows[0].keys(), *(row.values() for row in rows)):
-        print(*(f"{cell!s:<24}" for cell in row))
+        compare(a, folder / "pairs", folder / "test" / "test_lmdb", folder)
 
 
 if __name__ == "__main__":

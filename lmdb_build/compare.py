@@ -2,7 +2,7 @@
 
 Files in the output folder, for each net:
 
-    NAME.log, NAME.scores.json            its training (netspec train --scores)
+    NAME.log, NAME.scores.json            its training (netspec train --scores); NAME.2 is the second of one net
     NAME.ITERATION.scores.json            a snapshot that the training did not test (netspec test --scores)
     NAME.train.npz, NAME.validation.npz   the descriptors of both databases' pairs (netspec extract)
     NAME.test.npz                         those of the test pairs, if a database of them is given
@@ -19,7 +19,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -49,6 +49,7 @@ class Entry:
     length   number of training iterations
     tests    number of batches per test
     sources  train, validation -> data layer -> database
+    number   which of the trainings of its net, from 1; they have different seeds
     """
 
     solver: str
@@ -60,11 +61,12 @@ class Entry:
     bottoms: tuple[str, ...]
     loss: str
     sources: dict[str, dict[str, str]]
+    number: int = 1
 
     @property
     def stem(self) -> str:
         """The name as part of a file's name."""
-        return re.sub(r"[^\w.-]", "_", self.name)
+        return re.sub(r"[^\w.-]", "_", self.name) + (f".{self.number}" if self.number > 1 else "")
 
 
 def read_entry(path: str) -> Entry:
@@ -137,13 +139,20 @@ def compare(
 ) -> tuple[str, list[Path]]:
     """Train the nets of the solvers and evaluate a snapshot of each; return the tables and the report's files.
 
+    Solvers of one net are its trainings with several seeds; the tables have their means.
     ``say`` is called with messages, ``step`` with the progress of each training. Raises SpecError or InputError for
     faults in the files.
     """
-    entries = [read_entry(path) for path in solvers]
-    for i, entry in enumerate(entries):
-        if entry.stem in [other.stem for other in entries[:i]]:
+    entries = list[Entry]()
+    for path in solvers:
+        entry = read_entry(path)
+        entry = replace(entry, number=1 + sum(other.net == entry.net for other in entries))
+        if entry.prefix and entry.prefix in [other.prefix for other in entries]:
+            fault = f'found a second training with snapshot_prefix "{entry.prefix}"; give each training its own'
+            raise SpecError(fault, Where(entry.solver))
+        if entry.stem in [other.stem for other in entries]:
             raise SpecError(f'found a second net named "{entry.name}"; give each net its own name', Where(entry.net))
+        entries.append(entry)
         layers = entry.sources["validation"]
         if choices.test and len(choices.test) != len(layers):
             found = f"{len(choices.test)} for a net with {len(layers)} data layers"

@@ -51,7 +51,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Options:
+class DatumOptions:
     """How images become Datums of a database.
 
     color       color or grayscale
@@ -103,7 +103,7 @@ def write_databases(
     entries: Sequence[Entry],
     root: str,
     paths: Sequence[str],
-    options: Options,
+    options: DatumOptions,
     key: Callable[[int, Entry], str],
     progress: Progress = silent,
 ) -> None:
@@ -149,14 +149,14 @@ def write_databases(
         log.warning("convert_imageset.cpp:121", f"Skipped {count} of {len(entries)} images, which cannot be read")
 
 
-def _try(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tuple[int, ...]] | SpecError:
+def _try(entry: Entry, root: str, options: DatumOptions) -> tuple[list[bytes], tuple[int, ...]] | SpecError:
     try:
         return _records(entry, root, options)
     except SpecError as fault:
         return fault
 
 
-def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tuple[int, ...]]:
+def _records(entry: Entry, root: str, options: DatumOptions) -> tuple[list[bytes], tuple[int, ...]]:
     """Return an entry's serialized Datums, and the shape of their values."""
     paths = [root + name for name in entry.images]
     try:
@@ -174,7 +174,7 @@ def _records(entry: Entry, root: str, options: Options) -> tuple[list[bytes], tu
     return [array_to_datum(stacked, entry.label).SerializeToString()], stacked.shape
 
 
-def _encode(path: str, label: int, options: Options) -> tuple[bytes, tuple[int, ...]]:
+def _encode(path: str, label: int, options: DatumOptions) -> tuple[bytes, tuple[int, ...]]:
     """Return one encoded Datum. A file that already has the requested format is stored unchanged, as in Caffe.
 
     Unlike here, Caffe stores a color file unchanged even with -gray.

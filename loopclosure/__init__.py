@@ -8,39 +8,55 @@ if TYPE_CHECKING:
     from typing import Any
 
     from loopclosure.closing.locate import Locator
+    from loopclosure.closing.measure import Loop
     from loopclosure.closing.online import LoopCloser
+    from loopclosure.closing.synchronizer import Synchronizer
+    from loopclosure.commands import close, detect, evaluate
     from loopclosure.descriptors.thumbnails import Thumbnailer
     from loopclosure.detector.decision import LoopResult
-    from loopclosure.detector.describers import load_describe
     from loopclosure.detector.detector import LoopDetector
     from loopclosure.detector.map import Map
+    from loopclosure.detector.verification import GeometricCheck
     from loopclosure.detector.visitor import Visitor
+    from loopclosure.places import messages
     from loopclosure.places.intrinsics import Intrinsics as Camera
     from loopclosure.places.sequences import read_sequence
 
 _HOMES = {
     "Camera": "loopclosure.places.intrinsics:Intrinsics",
+    "GeometricCheck": "loopclosure.detector.verification:GeometricCheck",
     "Locator": "loopclosure.closing.locate:Locator",
+    "Loop": "loopclosure.closing.measure:Loop",
     "LoopCloser": "loopclosure.closing.online:LoopCloser",
     "LoopDetector": "loopclosure.detector.detector:LoopDetector",
     "LoopResult": "loopclosure.detector.decision:LoopResult",
     "Map": "loopclosure.detector.map:Map",
+    "Synchronizer": "loopclosure.closing.synchronizer:Synchronizer",
     "Thumbnailer": "loopclosure.descriptors.thumbnails:Thumbnailer",
     "Visitor": "loopclosure.detector.visitor:Visitor",
-    "load_describe": "loopclosure.detector.describers:load_describe",
+    "close": "loopclosure.commands:close",
+    "detect": "loopclosure.commands:detect",
+    "evaluate": "loopclosure.commands:evaluate",
+    "messages": "loopclosure.places.messages",
     "read_sequence": "loopclosure.places.sequences:read_sequence",
 }
 
 __all__ = [
     "Camera",
+    "GeometricCheck",
     "Locator",
+    "Loop",
     "LoopCloser",
     "LoopDetector",
     "LoopResult",
     "Map",
+    "Synchronizer",
     "Thumbnailer",
     "Visitor",
-    "load_describe",
+    "close",
+    "detect",
+    "evaluate",
+    "messages",
     "read_sequence",
 ]
 
@@ -51,4 +67,4 @@ def __getattr__(name: str) -> "Any":
     from importlib import import_module
 
     module, _, attribute = _HOMES[name].partition(":")
-    return getattr(import_module(module), attribute)
+    return getattr(import_module(module), attribute) if attribute else import_module(module)

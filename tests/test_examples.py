@@ -10,7 +10,7 @@ import pytest
 
 import forked
 from lmdb_build.pairs.list_file import read_pair_list
-from loopclosure.evaluate import judge
+from loopclosure.evaluation import judge
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import load_traverses

@@ -39,7 +39,7 @@ STEPS = {
     "loop closure in the third house, with a net that was trained on other places": [
         f"netspec extract {DEPLOY} --weights {WEIGHTS} --blob feat --images walk/walk_3 --out features.npz",
         "loopclosure evaluate walk/walk_3 --method features:features.npz --method thumbnails --out report",
-        "loopclosure detect walk/walk_3 --features features.npz --out loops",
+        "loopclosure detect walk/walk_3 --describe features.npz --out loops",
     ],
     "the loops correct odometry that drifts": [
         "loopclosure close walk/walk_3 --loops loops/loops.csv --drift 2 --out closed",

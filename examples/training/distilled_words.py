@@ -17,11 +17,9 @@ from torch.nn import functional
 
 import netspec
 import netspec.pycaffe as caffe
-from lmdb_build.pairs.list_file import read_pair_list
-from loopclosure.places.frames import read_bgr
+from lmdb_build import read_pair_list
 from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
-from netspec.solver.precision import has_bfloat16
 
 RATE, WARM, SCALE, VIEWS = 8e-4, 30, 15, 128  # learning rate, iterations until it is reached, and views per batch
 OWN = 0.3  # weight of the original net as a teacher
@@ -39,7 +37,7 @@ views, like = [], []
 for each in lists:
     files = [each.parent / name for pair in read_pair_list(each) for name in (pair.first, pair.second)]
     for k in range(0, len(files), VIEWS):
-        images = [read_bgr(file) for file in files[k : k + VIEWS]]
+        images = [cv2.imread(str(file)) for file in files[k : k + VIEWS]]
         small = [cv2.resize(image, (128, 96), interpolation=cv2.INTER_AREA) for image in images]
         views.append(np.array(small).transpose(0, 3, 1, 2))
         feats = torch.from_numpy(teacher(images))
@@ -59,7 +57,8 @@ for k in range(iterations):
     cut[:, 0, 0] *= rng.choice((-1, 1))
     x = torch.from_numpy(views[batch]).float()
     x = functional.grid_sample(x, functional.affine_grid(cut, list(x.shape), False), align_corners=False)
-    with torch.autocast("cpu", torch.bfloat16, enabled=bool(has_bfloat16())):  # without, it would be slower
+    # Without instructions for bfloat16, it would be slower.
+    with torch.autocast("cpu", torch.bfloat16, enabled=torch.ops.mkldnn._is_mkldnn_bf16_supported()):
         units = words(data=x)
     whole, parts = (SCALE * units[name].float() @ units[name].float().T for name in ("whole", "parts"))
     loss = torch.zeros(())

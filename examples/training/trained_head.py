@@ -14,8 +14,7 @@ from torch.nn import functional
 
 import netspec
 import netspec.pycaffe as caffe
-from lmdb_build.pairs.list_file import read_pair_list
-from loopclosure.places.frames import read_bgr
+from lmdb_build import read_pair_list
 from netspec.inspect.features.describer import Describer
 from netspec.proto.text import read_net, write_text
 
@@ -37,7 +36,7 @@ trunk, maps = Describer(prototxt, source, "head_blocks").image_net, []
 for views in lists:
     if not views.with_suffix(".npy").exists():
         files = [views.parent / name for pair in read_pair_list(views) for name in (pair.first, pair.second)]
-        batches = ([read_bgr(file) for file in files[k : k + VIEWS]] for k in range(0, len(files), VIEWS))
+        batches = ([cv2.imread(str(file)) for file in files[k : k + VIEWS]] for k in range(0, len(files), VIEWS))
         np.save(views.with_suffix(".npy"), np.concatenate([trunk(batch).astype(np.float16) for batch in batches]))
     maps.extend(np.load(views.with_suffix(".npy"), mmap_mode="r").reshape(-1, VIEWS, 192, 9, 12))
 head, rng = netspec.load_net(example, "TRAIN", seed=1), np.random.default_rng(1)

@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 from light import change_light
 
-from lmdb_build.pairs.list_file import write_pair_list
-from lmdb_build.picture import write_jpeg
-from loopclosure.places.frames import image_paths, read_bgr
+from lmdb_build import write_pair_list
+from loopclosure import read_sequence
 
 PER_RUN = 8  # the most places of one run in a batch
 LEAST_GAP_S = 4.0  # places of one run in a batch are more than this many seconds apart
@@ -61,7 +60,7 @@ def read_runs(sources: list[str], step: float) -> Runs:
                 ]
             runs += [(f"{table} {name}", second, image) for name, second, image in rows]
         else:
-            runs += [(source, number * step, image) for number, image in enumerate(image_paths(source))]
+            runs += [(source, number * step, image) for number, image in enumerate(read_sequence(source).paths)]
     names, stamps, images = zip(*runs, strict=True)
     return Runs([image.resolve() for image in images], np.unique(names, return_inverse=True)[1], np.array(stamps))
 
@@ -167,12 +166,12 @@ def main() -> None:
         mirrored, position = rng.random() < 0.5, rng.uniform(0, 1, 2)
         names = [f"{a.out.name}/{number:06d}_{side}.jpg" for side in "ab"]
         for image, name in zip(pair, names, strict=True):
-            picture = read_bgr(runs.images[image])
+            picture = cv2.imread(str(runs.images[image]))
             if mirrored:
                 picture = np.ascontiguousarray(picture[:, ::-1])
             view = cut_view(picture, (width, height), position, rng, a.viewpoint)
-            other = partial(read_bgr, runs.images[rng.integers(len(runs.images))])  # few views need it
-            write_jpeg(a.out.parent / name, change_light(view, other, rng, a.calm))
+            other = partial(cv2.imread, str(runs.images[rng.integers(len(runs.images))]))  # few views need it
+            cv2.imwrite(str(a.out.parent / name), change_light(view, other, rng, a.calm))  # quality 95
         listed.append((*names, 1))
     write_pair_list(a.out.with_name(f"{a.out.name}.txt"), listed, {"made by": f"views.py, seed {a.seed}"})
     print(f"{len(listed)} pairs of {len(runs.images)} images")

@@ -16,8 +16,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lmdb_build.databases import (
+    DatumOptions,
     Entry,
-    Options,
     image_key,
     pair_key,
     read_pairs,
@@ -153,7 +153,7 @@ def _convert(
     log.info("convert_imageset.cpp:89", f"A total of {len(entries)} {what}.")
     if arguments.encode_type and not arguments.encoded:
         log.info("convert_imageset.cpp:92", "encode_type specified, assuming encoded=true.")
-    options = Options(
+    options = DatumOptions(
         color=not arguments.gray,
         size=(height, width) if height else None,
         encoding=arguments.encode_type.lstrip(".") if _is_encoded(arguments) else None,

@@ -1,4 +1,4 @@
-"""``lmdb-build pairs``, ``sheet`` and ``join``: lists of labeled pairs."""
+"""``lmdb-build pairs`` and ``sheet``: lists of labeled pairs."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from lmdb_build.pairs.build import Plan, build_lists
 from lmdb_build.pairs.by_list import MaskSource, TraverseSource, folders_source
 from lmdb_build.pairs.by_pose import NEGATIVES, PoseRule, PoseSource, Scenes
 from lmdb_build.pairs.choose import SPLITS, PairSource
-from lmdb_build.pairs.list_file import join_lists, root_of, write_contact_sheet
-from loopclosure.descriptors.feature_file import read_features
+from lmdb_build.pairs.list_file import root_of, write_contact_sheet
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.masks import CAMERAS
@@ -65,7 +64,6 @@ def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
     _add_pairs(commands)
     _add_sheet(commands)
-    _add_join(commands)
 
 
 def _add_pairs(commands: Commands) -> None:
@@ -183,16 +181,6 @@ def _add_pairs(commands: Commands) -> None:
     )
     for split in SPLITS:
         group.add_argument(f"--{split}-sequences", type=_names, metavar="A,B", help=f"sequences (or groups) of {split}")
-    group.add_argument(
-        "--hard-negatives", type=Path, metavar="NPZ", help="features (.npz) for choosing negatives that look alike"
-    )
-    group.add_argument(
-        "--hard-share",
-        type=float,
-        default=0.5,
-        metavar="SHARE",
-        help="share of the negatives that --hard-negatives chooses (default: %(default)g)",
-    )
     group.add_argument("--seed", type=seed, default=1, metavar="N", help="random seed (default: %(default)s)")
 
 
@@ -211,8 +199,6 @@ def _pairs(arguments: argparse.Namespace) -> None:
         split_gap=arguments.split_gap,
         named=named,
         at_most=arguments.at_most,
-        features=read_features(arguments.hard_negatives) if arguments.hard_negatives else None,
-        hard_share=arguments.hard_share,
     )
     lists = build_lists(source, plan, root, arguments.out)
     for written in lists.values():
@@ -336,24 +322,3 @@ def _sheet(arguments: argparse.Namespace) -> None:
     root = arguments.root or root_of(arguments.list)
     write_contact_sheet(arguments.list, root, arguments.picture, arguments.rows, arguments.seed)
     print(arguments.picture)
-
-
-def _add_join(commands: Commands) -> None:
-    parser = commands.add_parser("join", help="join several lists and shuffle the result")
-    parser.set_defaults(function=_join)
-    parser.add_output("out", type=Path, metavar="OUT", help="the list to write")
-    parser.add_argument("list", nargs="+", type=Path, metavar="LIST", help="lists of pairs")
-    parser.add_argument(
-        "--root",
-        type=Path,
-        metavar="FOLDER",
-        help="folder that the image names are relative to (default: the common parent of the lists' roots)",
-    )
-    parser.add_argument(
-        "--seed", type=seed, default=1, metavar="N", help="random seed of the order (default: %(default)s)"
-    )
-
-
-def _join(arguments: argparse.Namespace) -> None:
-    number, root = join_lists(arguments.list, arguments.out, arguments.seed, arguments.root)
-    print(f"{arguments.out}: {number} pairs, images below {root}")

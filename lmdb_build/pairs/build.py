@@ -16,14 +16,11 @@ from lmdb_build.pairs.choose import (
     Indices,
     Pairs,
     PairSource,
-    Wanted,
     choose_pairs,
-    hard_negatives,
     split_by_group,
     split_by_time,
 )
 from lmdb_build.pairs.list_file import ROOT_FOLDER, write_pair_list
-from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
 from netspec.files.paths import relative
 
@@ -38,8 +35,6 @@ class Plan:
     split_gap    minimum gap in time between two splits
     named        names of the groups of each split
     at_most      if there are too few pairs, use all of them instead of raising an error
-    features     descriptors for choosing hard negatives
-    hard_share   share of the negatives that are the nearest by ``features``
     """
 
     counts: Mapping[str, int]
@@ -49,8 +44,6 @@ class Plan:
     split_gap: float = 0.0
     named: Mapping[str, list[str]] = field(default_factory=dict)
     at_most: bool = False
-    features: Features | None = None
-    hard_share: float = 0.5
 
     def check(self) -> None:
         """Raise InputError for values out of range."""
@@ -61,8 +54,6 @@ class Plan:
                 )
         if not any(self.counts.values()):
             raise InputError("no pairs are asked for; give --train, --val or --test a number")
-        if not 0 <= self.hard_share <= 1:
-            raise InputError(f"--hard-share must be 0 to 1, not {self.hard_share}")
         if self.seed < 0:
             raise InputError(f"a seed must be 0 or more, not {self.seed}")
         for split, share in self.shares.items():
@@ -96,12 +87,8 @@ def build_lists(source: PairSource, plan: Plan, root: Path, out: Path) -> dict[s
     plan.check()
     splits = []
     for name, images in split_images(source, plan).items():
-        hard = None
-        if plan.features is not None and len(images):
-            rows = plan.features.rows_of([Path(source.names[image]) for image in images])
-            hard = hard_negatives(source, images, rows, round(plan.counts[name] // 2 * plan.hard_share))
-        wanted = Wanted(plan.counts[name], plan.at_most, hard)
-        splits.append(Split(name, images, choose_pairs(source, images, wanted, _stream(plan.seed, name), name)))
+        stream = _stream(plan.seed, name)
+        splits.append(Split(name, images, choose_pairs(source, images, plan.counts[name], stream, name, plan.at_most)))
     lists = {}
     for split in splits:
         pairs = split.pairs
@@ -133,8 +120,6 @@ def _head(source: PairSource, plan: Plan, split: Split, root: Path, out: Path) -
     head = dict(source.settings)
     head[ROOT_FOLDER] = relative(root.resolve(), out.resolve())
     head["split"] = f"{split.name}, by {cut}; shares: {shares}; {len(split.images)} images"
-    if plan.features is not None:
-        head["hard negatives"] = f"{plan.hard_share:g} of the negatives, by {plan.features.path.name}"
     head["pairs"] = "; ".join(f"{kind}: {number}" for kind, number in kinds(source, split.pairs).items())
     head["seed"] = str(plan.seed)
     return head

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loopclosure.descriptors.similarity import squared_distances
 from loopclosure.errors import InputError
 
 POSITIVE, NEGATIVE, LEFT_OUT = 1, 0, -1
@@ -140,41 +139,22 @@ def split_by_group(
     return {split: np.flatnonzero(owner[source.groups] == number) for number, split in enumerate(splits)}
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """The pairs to choose for a split: ``count``, half of them positive.
+def choose_pairs(
+    source: PairSource, images: Indices, count: int, rng: np.random.Generator, split: str, at_most: bool = False
+) -> Pairs:
+    """Choose ``count`` different pairs among ``images``, half of them positive, in shuffled order.
 
-    at_most         if there are not enough pairs, use as many as there are, half of them positive
-    hard_negatives  (K, 2) pairs that are used as negatives before others are drawn
+    Each half is drawn uniformly from all pairs of its label. With ``at_most``, there are fewer if there are not enough.
+    Otherwise that raises InputError, which names the ``split``.
     """
-
-    count: int
-    at_most: bool = False
-    hard_negatives: Indices | None = None
-
-
-def choose_pairs(source: PairSource, images: Indices, wanted: Wanted, rng: np.random.Generator, split: str) -> Pairs:
-    """Choose different pairs among ``images``, in shuffled order.
-
-    Each half is drawn uniformly from all pairs of its label, except for hard negatives.
-    Raises InputError, which names the ``split``, if there are not enough pairs.
-    """
-    half, hard_negatives = wanted.count // 2, wanted.hard_negatives
-    hard = np.zeros((0, 2), np.intp) if hard_negatives is None else hard_negatives[:half]
+    half = count // 2
     found = find_pairs(source, images, {POSITIVE: half, NEGATIVE: half}, rng)
-    fresh = ~np.isin(_codes(found[NEGATIVE]), _codes(hard))
-    negatives = np.concatenate([hard, found[NEGATIVE][fresh]])
-    available = {POSITIVE: len(found[POSITIVE]), NEGATIVE: len(negatives)}
-    half = _enough_pairs(available, half, len(images), split, wanted.at_most)
-    pairs = np.concatenate([found[POSITIVE][:half], negatives[:half]])
+    available = {label: len(found[label]) for label in (POSITIVE, NEGATIVE)}
+    half = _enough_pairs(available, half, len(images), split, at_most)
+    pairs = np.concatenate([found[POSITIVE][:half], found[NEGATIVE][:half]])
     labels = np.repeat([POSITIVE, NEGATIVE], half).astype(np.uint8)
     order = rng.permutation(len(pairs))  # Caffe's Data layer reads a database in its order
     return Pairs(pairs[order, 0], pairs[order, 1], labels[order])
-
-
-def _codes(pairs: Indices) -> Indices:
-    """Return one number (n,) for each unordered pair (n, 2)."""
-    return (np.minimum(pairs[:, 0], pairs[:, 1]) << 32) + np.maximum(pairs[:, 0], pairs[:, 1])
 
 
 def _enough_pairs(available: Mapping[int, int], half: int, images: int, split: str, at_most: bool) -> int:
@@ -258,42 +238,3 @@ def _draw_and_judge(
             _, at = np.unique(fresh, return_index=True)
             codes[label] = fresh[np.sort(at)][: wanted[label]]
     return {label: images[np.column_stack(np.divmod(code, count))] for label, code in codes.items()}
-
-
-# Number of nearest images examined per image; in a video, the first hundreds may be neighbors in time.
-DEEPEST = 512
-ROWS_AT_ONCE = 512
-
-
-def hard_negatives(source: PairSource, images: Indices, features: NDArray[np.floating], wanted: int) -> Indices:
-    """Choose up to ``wanted`` negative pairs (n, 2) of ``images`` (m,) with the nearest ``features`` (m, D).
-
-    Every image's nearest negative comes first, then every image's second nearest, and so on, each time with the nearer
-    pairs first. So the pairs are of all places, and not only of the place that the net knows least.
-    """
-    count = len(images)
-    depth = min(DEEPEST, count - 1)
-    if wanted <= 0 or depth < 1:
-        return np.zeros((0, 2), np.intp)
-    features = features.astype(np.float64)
-    squares = (features**2).sum(axis=1)
-    keep = 2 * -(-wanted // count) + 2  # of each image; both images of a pair may find it
-    parts = []
-    for start in range(0, count, ROWS_AT_ONCE):
-        rows = np.arange(start, min(start + ROWS_AT_ONCE, count))
-        distances = squared_distances(features[rows], features, squares[rows, None], squares)
-        distances[np.arange(len(rows)), rows] = np.inf
-        nearest = np.argpartition(distances, depth - 1, axis=1)[:, :depth]
-        near = np.take_along_axis(distances, nearest, axis=1)
-        order = np.argsort(near, axis=1, kind="stable")
-        nearest, near = np.take_along_axis(nearest, order, axis=1), np.take_along_axis(near, order, axis=1)
-        first = np.repeat(rows, depth)
-        negative = source.judge(images[first], images[nearest.ravel()]).reshape(nearest.shape) == NEGATIVE
-        rank = np.cumsum(negative, axis=1)
-        row, column = np.nonzero(negative & (rank <= keep))
-        parts.append(np.column_stack([rank[row, column], near[row, column], rows[row], nearest[row, column]]))
-    table = np.concatenate(parts)
-    table = table[np.lexsort((table[:, 1], table[:, 0]))]
-    pairs = np.sort(table[:, 2:].astype(np.intp), axis=1)
-    _, at = np.unique(pairs @ np.array([count, 1]), return_index=True)
-    return images[pairs[np.sort(at)][:wanted]]

@@ -5,9 +5,8 @@ A name that contains blanks, or begins with ``#``, is in double quotes.
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ from loopclosure.places.frames import read_bgr
 from netspec.errors import SpecError
 from netspec.files.kinds import unreadable
 from netspec.files.opencv import cv2
-from netspec.files.paths import relative
 from netspec.files.whole_file import write_whole
 
 ROOT_FOLDER = (
@@ -102,32 +100,6 @@ def _quoted(name: str) -> str:
 def root_of(path: Path) -> Path:
     """Return the folder that a list's images are relative to: the one in its header, or else the list's own folder."""
     return path.parent / read_settings(path).get(ROOT_FOLDER, ".")
-
-
-def join_lists(lists: Sequence[Path], out: Path, seed: int, root: Path | None = None) -> tuple[int, Path]:
-    """Write the pairs of several lists, shuffled together, as one; return their number and the common root folder.
-
-    Image names become relative to ``root`` or to the common parent of the lists' roots.
-    """
-    roots = [root_of(path).resolve() for path in lists]
-    common = Path(os.path.commonpath(roots)) if root is None else root.resolve()
-    pairs = []
-    for path, own_root in zip(lists, roots, strict=True):
-        prefix = relative(own_root, common)
-        if prefix.startswith(".."):
-            raise InputError(
-                f"its images are in {own_root}, not below the root folder {common}; give another root", path
-            )
-        above = "" if prefix == "." else prefix + "/"
-        pairs += [(above + pair.first, above + pair.second, pair.label) for pair in read_pair_list(path)]
-    order = np.random.default_rng(seed).permutation(len(pairs))
-    settings = {
-        "source": "the lists " + ", ".join(relative(path, out.parent) for path in lists),
-        ROOT_FOLDER: relative(common, out.parent.resolve()),
-        "seed": str(seed),
-    }
-    write_pair_list(out, (pairs[index] for index in order), settings)
-    return len(pairs), common
 
 
 def _read_lines(path: Path) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from loopclosure.cli import close, detect, evaluate
+from loopclosure.cli import close, detect, evaluate, watch
 from loopclosure.cli import map as maps
 from netspec.terminal.commands import run
 from netspec.terminal.parser import QUIET, Commands, Parser, program
@@ -20,6 +20,6 @@ def parser() -> Parser:
     """Return the parser of all commands."""
     made = program("loopclosure", "Evaluate, detect and close loops.")
     commands = Commands(made, **QUIET)
-    for module in (evaluate, detect, close, maps):
+    for module in (evaluate, detect, watch, close, maps):
         module.add_commands(commands)
     return made

@@ -5,26 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
-from loopclosure.cli.data_set import sequence, typed
-from loopclosure.closing.close import close, drifted, summary, write_closed
-from loopclosure.closing.measure import depth_scale_said, measure, read_loops
-from loopclosure.errors import InputError
+from loopclosure.closing.close import summary
+from loopclosure.commands import close
 from loopclosure.places import intrinsics
-from loopclosure.places.image_sequence import ImageSequence
-from loopclosure.places.source import CLOSED, POSES, TOPICS
+from loopclosure.places.source import POSES, TOPICS
 from netspec.terminal.commands import WrongUsage
-from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands, seed
 
 
 def add_commands(commands: Commands) -> None:
     """Add ``close``."""
-    _add_close(commands)
-
-
-def _add_close(commands: Commands) -> None:
     parser = commands.add_parser("close", help="correct a path using the loops that detect found")
     parser.set_defaults(function=_close)
     parser.add_argument(
@@ -58,38 +48,15 @@ def _close(a: argparse.Namespace) -> None:
         raise WrongUsage("--odometry-form needs --odometry")
     if a.seed is not None and a.drift is None:
         raise WrongUsage("--seed needs --drift")
-    given = intrinsics.from_text(a.camera) if a.camera else None
-    source = typed(a.source, CLOSED)
-    frames = sequence(source, out / "frames", odometry=a.odometry, form=a.odometry_form)
-    camera = given or frames.camera
-    if camera is None:
-        raise InputError(f"has no camera calibration; give --camera {intrinsics.FORM}", frames.source)
-    odometry = _odometry(a, frames)[source.selection().numbers(len(frames))]
-    frames = frames.taken(source.selection())
-    loops = measure(frames, read_loops(Path(a.loops), frames), camera, odometry, bar)
-    if a.drift is None and (said := depth_scale_said(frames, camera)):
-        warn(said)
-    closed = close(odometry, loops, frames.poses, stamps=frames.stamps)
-    write_closed(out, closed, frames.stamps, frames.names)
-    # Imported here, since it takes seconds and only this command needs it.
-    from loopclosure.report.plots import draw_paths
-
-    draw_paths(out / "paths.png", closed)
+    closed = close(
+        a.source,
+        a.loops,
+        out,
+        odometry=a.odometry,
+        odometry_form=a.odometry_form,
+        drift=a.drift,
+        seed=1 if a.seed is None else a.seed,
+        camera=a.camera,
+    )
     print("\n".join(summary(closed)))
     print(f"{out / 'closed.g2o'}, {out / 'closed.txt'}, {out / 'paths.png'}")
-
-
-def _odometry(a: argparse.Namespace, frames: ImageSequence) -> np.ndarray:
-    """Return the path (F, 7) to correct, NaN for frames without a pose. Raises InputError if there is none."""
-    if a.drift is None:
-        if frames.odometry is None:
-            raise InputError("has no odometry; give --odometry FILE, or --drift PERCENT to simulate it", frames.source)
-        return frames.odometry
-    if frames.poses is None:
-        raise InputError(
-            "has no true poses to simulate drift from; give --odometry, or add ,poses=FILE to the source", frames.source
-        )
-    known = np.all(np.isfinite(frames.poses), axis=1)
-    path = frames.poses.copy()
-    path[known] = drifted(path[known], a.drift, 1 if a.seed is None else a.seed)
-    return path

@@ -5,37 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopclosure import evaluate
-from loopclosure.cli.data_set import HELP, add_data_set, data_set
-from loopclosure.errors import InputError
-from loopclosure.methods.base import MethodContext
-from loopclosure.methods.named import METHODS, named_methods
-from loopclosure.places.frames import image_paths
-from loopclosure.places.source import FRAMES, Source, read_source
-from netspec.terminal.output import bar
+from loopclosure.cli.data_set import HELP, add_data_set, keyword
+from loopclosure.commands import evaluate
+from loopclosure.methods.named import METHODS
 from netspec.terminal.parser import Commands, seed
 
 
 def add_commands(commands: Commands) -> None:
-    """Add the commands of this module."""
-    _add_evaluate(commands)
-
-
-def _training(text: str) -> Source:
-    try:
-        return read_source(text, {"": FRAMES})
-    except InputError as fault:
-        raise argparse.ArgumentTypeError(str(fault)) from None
-
-
-def _setting(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals or "." not in name:
-        raise argparse.ArgumentTypeError(f"found {text}, expected NAME.SETTING=VALUE")
-    return name, value
-
-
-def _add_evaluate(commands: Commands) -> None:
+    """Add ``evaluate``."""
     parser = commands.add_parser(
         "evaluate",
         help="run methods on one data set and write a report",
@@ -56,7 +33,7 @@ def _add_evaluate(commands: Commands) -> None:
     parser.add_argument(
         "--set",
         action="append",
-        type=_setting,
+        type=keyword,
         default=[],
         metavar="NAME.SETTING=VALUE",
         help="a setting of a method, by its name or label (may be repeated), such as fabmap.model=words.npz",
@@ -64,7 +41,6 @@ def _add_evaluate(commands: Commands) -> None:
     parser.add_argument(
         "--train",
         action="append",
-        type=_training,
         default=[],
         metavar="PATH[,KEY=VALUE]",
         help="images to train vocabularies on, not those evaluated: a folder, list or TUM sequence, "
@@ -80,18 +56,23 @@ def _add_evaluate(commands: Commands) -> None:
 def _evaluate(a: argparse.Namespace) -> None:
     # Imported here, since it takes seconds and only this command needs it.
     from loopclosure.report.files import measures_text
-    from loopclosure.report.page import verdict, write_report
+    from loopclosure.report.page import verdict
 
-    data = data_set(a)
-    context = MethodContext(data.exclude_frames, a.seed)
-    methods = named_methods(a.method, context, dict(a.set))
-    train: list[Path] = []
-    for source in a.train:
-        images = image_paths(source.path)
-        train += [images[i] for i in source.selection().numbers(len(images))]
-    training = f"{len(train)} images of {', '.join(t.path.name for t in a.train)}" if train else "no training images"
-    evaluation = evaluate.evaluate(data, methods, train, training, bar)
-    page = write_report(evaluation, a.out, a.title, a.command_line)
+    evaluation = evaluate(
+        a.source,
+        a.method,
+        a.out,
+        settings=dict(a.set),
+        train=a.train,
+        title=a.title,
+        seed=a.seed,
+        tolerance=a.tolerance,
+        max_distance=a.max_distance,
+        max_angle=a.max_angle,
+        exclude_frames=a.exclude_frames,
+        exclude_seconds=a.exclude_seconds,
+        command=a.command_line,
+    )
     print(verdict(evaluation))
     print(measures_text(evaluation))
-    print(f"report: {page}")
+    print(f"report: {Path(a.out) / 'report.html'}")

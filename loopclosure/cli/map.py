@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from loopclosure.cli.data_set import recording_of, warn_of_unreadable
 from loopclosure.closing.close import summary
 from loopclosure.closing.locate import LOCATED, Located, Locator, located_said, place_errors_said
 from loopclosure.closing.sessions import close_map, write_closed_map
@@ -17,10 +16,10 @@ from loopclosure.detector.describers import load_describe
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.map import EXTRACTED, Map, checked_name
-from loopclosure.detector.saved import Describe
 from loopclosure.detector.visitor import Visitor
 from loopclosure.index.index import INDEXES
 from loopclosure.methods.drive import last_session
+from loopclosure.opening import readable, recording_of
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import FORM
 from netspec.files.paths import inside
@@ -71,9 +70,9 @@ def _add_build(commands: Commands) -> None:
 
 
 def _build(a: argparse.Namespace) -> None:
-    describe = load_describe(checked_name(a.describe))
+    load_describe(checked_name(a.describe))
     recordings = _recordings(a, 0)  # before the map is made, in case a name is mistyped
-    _add_all(Map.create(a.map, a.describe), describe, recordings, a.index)
+    _add_all(Map.create(a.map, a.describe), recordings, a.index)
 
 
 def _add_add(commands: Commands) -> None:
@@ -84,7 +83,7 @@ def _add_add(commands: Commands) -> None:
 
 def _add(a: argparse.Namespace) -> None:
     into = Map(a.map)
-    _add_all(into, load_describe(into.describer), _recordings(a, len(into.sessions)), a.index)
+    _add_all(into, _recordings(a, len(into.sessions)), a.index)
 
 
 def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
@@ -93,11 +92,11 @@ def _recordings(a: argparse.Namespace, first: int) -> list[ImageSequence]:
     return [recording_of(text, folder, a.camera) for text, folder in zip(a.source, folders, strict=True)]
 
 
-def _add_all(into: Map, describe: Describe, recordings: list[ImageSequence], index: str) -> None:
+def _add_all(into: Map, recordings: list[ImageSequence], index: str) -> None:
     for recording in recordings:
         before = len(into)
-        results = into.add(recording, describe, index, bar, _decided)
-        warn_of_unreadable(recording)
+        results = into.add(recording, None, index, bar, _decided)
+        readable(recording)
         loops = [result.match for result in results if result.match is not None]
         between = sum(frame < before for frame in loops)
         summary = f"{len(results)} frames, {len(loops)} loops, {between} to earlier sessions"
@@ -126,14 +125,14 @@ def _add_query(commands: Commands) -> None:
 def _query(a: argparse.Namespace) -> None:
     known, out = Map(a.map), Path(a.out)
     recording = recording_of(a.source, out / "frames", a.camera)
-    detector, before = known.detector(load_describe(known.describer), a.index), len(known)
+    detector, before = known.detector(index=a.index), len(known)
     if a.index in INDEXES:  # in memory: the frames are added to the detector, not to the map
         run.remember_all(detector, recording, progress=bar)
         results = _decided(detector, own=False)
         results = [replace(result, query=result.query - before) for result in results]
     else:
         results = run.run_detector(Visitor(detector), recording, progress=bar)
-    recording = warn_of_unreadable(recording)
+    recording = readable(recording)
     loops = [result for result in results if result]
     found, said = _located(known, recording, loops)
     measured = LOCATED, {frame: each.cells() for frame, each in found.items()}

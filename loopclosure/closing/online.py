@@ -42,14 +42,6 @@ COMPARED = 100  # keyframes that a step is compared with
 UNKNOWN = 1e6  # the variance of a position that a loop does not measure
 
 
-@dataclass(frozen=True)
-class Keyframes:
-    """The least motion between keyframes, which are looked up and become nodes of the graph."""
-
-    step_m: float = 0.1
-    turn_rad: float = 0.1
-
-
 @dataclass
 class _Graph:
     """The keyframes so far: their stamps, poses by the odometry, drives, and edges. Poses are of the camera."""
@@ -67,7 +59,7 @@ class LoopCloser:
     detector   an empty one with a geometric check, which finds the points that measure its loops
     camera     the intrinsics of the images; ``camera.size`` may differ from theirs
     mount      pose (7,) of the camera in the frame of the robot, tx ty tz qx qy qz qw
-    keyframes  the least motion between keyframes
+    step_m, turn_rad  the least motion between keyframes, which are looked up and become nodes of the graph
     warn       gets a sentence for each image that is left out
 
     ``correction`` is the pose (7,) of the odometry's frame in the map, by the last of the ``solutions`` of the graph.
@@ -78,14 +70,15 @@ class LoopCloser:
         detector: LoopDetector,
         camera: Intrinsics,
         mount: Sequence[float] | np.ndarray = FORWARD,
-        keyframes: Keyframes | None = None,
+        step_m: float = 0.1,
+        turn_rad: float = 0.1,
         warn: Callable[[str], None] = log.logger.warning,
     ) -> None:
         if len(detector) or detector.check is None:
             raise InputError("loops are closed from the first keyframe on: the detector must be empty and have a check")
         self.detector, self.camera, self.warn = detector, camera, warn
         self.mount = np.asarray(mount, np.float64)
-        self.keyframes = keyframes or Keyframes()
+        self.step_m, self.turn_rad = step_m, turn_rad
         self._graph, self._lock, self._solving = _Graph(), Lock(), Lock()
         self._solve = IncrementalSolver().solve if installed() else solve
         self._solved, self._accepted = np.zeros((0, 7)), np.zeros(0, bool)
@@ -142,7 +135,7 @@ class LoopCloser:
 
     def _moved(self, step: np.ndarray) -> bool:
         turn = float(Rotation.from_quat(step[3:]).magnitude())
-        return float(np.linalg.norm(step[:3])) >= self.keyframes.step_m or turn >= self.keyframes.turn_rad
+        return float(np.linalg.norm(step[:3])) >= self.step_m or turn >= self.turn_rad
 
     def _jumps(self, stamp: float, pose: np.ndarray) -> bool:
         """Return whether the odometry was reset before the next keyframe."""

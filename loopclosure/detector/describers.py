@@ -7,7 +7,6 @@ import importlib.util
 import inspect
 import re
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
 
@@ -72,6 +71,9 @@ def _callable(target: Any, specification: str) -> Describe:
 
 
 def _entry_point(name: str) -> Any:
+    # Imported here, since detectors with another function do not need it.
+    from importlib.metadata import entry_points
+
     found = entry_points(group=DESCRIBERS)
     if name not in found.names:
         known = ", ".join(sorted(found.names)) or "none is installed: install the package again (pip install)"

@@ -60,32 +60,27 @@ class LoopDetector:
     def __init__(
         self,
         describe: Describe | str | None = "default",
-        settings: DetectorSettings | None = None,
         *,
         check: GeometricCheck | None = CHECK,
         index: Index | str = "exact",
         in_memory: int | None = None,
-        **changes: Any,
+        **settings: Any,
     ) -> None:
         """Make an empty detector. Without arguments, it is the one that docs/results.md measured.
 
         describe  the name of an included net, "default" or "small"; or a function, image (H, W, 3) uint8 BGR ->
                   descriptor (D,), the same D each time, or (views D,); None: use ``add_descriptor``
-        settings  the settings; single fields can also be given by name: ``LoopDetector(exclude_recent=50, top_k=5)``
         check     verifies candidates by their geometry, best first; None: no verification, which needs no images
         index     an empty index that stores and searches the descriptors, or a name for
                   :func:`loopclosure.index.index.open_index`
         in_memory keep the descriptors and points of about this many frames in memory, and the others in temporary files
                   (``TMPDIR`` names their folder); None: all of them
+        settings  fields of :class:`DetectorSettings`, as in ``LoopDetector(exclude_recent=50)``
         """
         self.describer = describe if isinstance(describe, str) else ""
         self.describe = load_describe(describe) if isinstance(describe, str) else describe
-        given = asdict(settings or DetectorSettings(views=getattr(self.describe, "views", 1)))
-        unknown = set(changes) - set(given)
-        if unknown:
-            raise TypeError(f"LoopDetector has no setting {', '.join(sorted(unknown))}; known: {', '.join(given)}")
+        chosen = DetectorSettings(**{"views": getattr(self.describe, "views", 1), **settings})
         self.fingerprint: str | None = fingerprint_of(self.describe)  # None: unknown, from an older file
-        chosen = DetectorSettings(**{**given, **changes})
         self.check = check
         self.loops: list[LoopResult] = []
         if in_memory is not None and in_memory < 1:
@@ -386,7 +381,7 @@ class LoopDetector:
             settings = from_json(DetectorSettings, about["settings"])
             if describe is None and re.fullmatch(NAME, name := about.get("describer", "")):
                 describe = name  # never a file or a module that a detector's file names
-            detector = cls(describe, settings, check=check, index=index, in_memory=in_memory)
+            detector = cls(describe, check=check, index=index, in_memory=in_memory, **asdict(settings))
             described, detector.fingerprint = detector.fingerprint, about.get("fingerprint")
             refuse_another(described or "", detector.fingerprint, "or start a new file", path)
             detector._take(arrays)

@@ -18,13 +18,14 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from loopclosure.detector.decision import LoopResult
-from loopclosure.detector.describers import NAME
+from loopclosure.detector.describers import NAME, load_describe
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
 from loopclosure.detector.frames import Points, points_of
@@ -143,13 +144,20 @@ class Map:
         """The names of all frames, SESSION/NAME."""
         return [f"{session.folder.name}/{name}" for session in self.sessions for name in session.names]
 
-    def detector(self, describe: Describe, index: str = "exact") -> LoopDetector:
+    @cached_property
+    def describe(self) -> Describe:
+        """The installed net that ``describer`` names."""
+        return load_describe(self.describer)
+
+    def detector(self, describe: Describe | None = None, index: str = "exact") -> LoopDetector:
         """Return a detector with all frames of the map and a geometric check.
 
-        index  a name for :func:`loopclosure.index.index.open_index`; only frames that are not in the index are added
+        describe  the function that described the frames; None: the installed net that the map names
+        index     a name for :func:`loopclosure.index.index.open_index`; only frames that are not in the index are added
 
         Raises InputError if the net's descriptors have another size or fingerprint than those of the map.
         """
+        describe = describe or self.describe
         instead = "or build the map again from its drives"
         refuse_another(fingerprint_of(describe), self.fingerprint, instead, self.folder)
         views = getattr(describe, "views", 1)
@@ -166,16 +174,17 @@ class Map:
     def add(
         self,
         recording: ImageSequence,
-        describe: Describe,
+        describe: Describe | None = None,
         index: str = "exact",
         progress: Progress = silent,
         decide: Decide | None = None,
     ) -> list[LoopResult]:
         """Add a recording as a session, and return a result for each of its frames: loops to all sessions.
 
-        ``decide`` finds the loops from all frames at once; None: each frame is decided when it is added. The loops are
-        written to ``loops.csv`` in the session's folder. Raises InputError, SpecError or OSError, and adds nothing, if
-        another process is adding, if there are no frames, or if a file cannot be written.
+        ``describe`` and ``index`` are those of :meth:`detector`. ``decide`` finds the loops from all frames at once;
+        None: each frame is decided when it is added. The loops are written to ``loops.csv`` in the session's folder.
+        Raises InputError, SpecError or OSError, and adds nothing, if another process is adding, if there are no frames,
+        or if a file cannot be written.
         """
         with only_one(inside(self.folder, LOCK), "wait until it has ended"):
             self._read()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from loopclosure.evaluate import RECALL_AT, WIDE, Evaluation, Outcome
+from loopclosure.evaluation import RECALL_AT, WIDE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH, PrecisionRecall
 from netspec.files.whole_file import write_whole

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from loopclosure.evaluate import RECALL_AT, Evaluation, Outcome
+from loopclosure.evaluation import RECALL_AT, Evaluation, Outcome
 from loopclosure.places.frames import read_bgr
 from loopclosure.places.same_place import WIDE_ANGLE_DEG, angles_deg, distances_m
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
 from loopclosure.closing.close import Closed, aligned
-from loopclosure.evaluate import WIDE, Evaluation, Outcome
+from loopclosure.evaluation import WIDE, Evaluation, Outcome
 from loopclosure.places.truth import Truth
 from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from netspec.errors import printable

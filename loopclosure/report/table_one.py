@@ -59,12 +59,21 @@ class Run:
     parameters: int
     iteration: int
 
-    def cells(self) -> tuple[str, ...]:
-        """Return the row of the table in the order of ``COLUMNS``."""
-        m = self.metrics
-        shares = (m.precision, m.recall, m.accuracy, m.f1, m.roc_auc)
-        figures = (f"{m.threshold:.4g}", f"{self.milliseconds:.2f}", str(self.parameters), str(self.iteration))
-        return (self.name, *(f"{share:.3f}" for share in shares), *figures)
+
+def by_net(runs: Sequence[Run]) -> list[list[Run]]:
+    """Return the trainings of each net; several have different seeds."""
+    nets: dict[str, list[Run]] = {}
+    for run in runs:
+        nets.setdefault(run.name, []).append(run)
+    return list(nets.values())
+
+
+def _cells(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Return the row of a net in the order of ``COLUMNS``: the means over its trainings, and what differs in them."""
+    fields = ("precision", "recall", "accuracy", "f1", "roc_auc")
+    shares = [f"{np.mean([getattr(run.metrics, field) for run in runs]):.3f}" for field in fields]
+    each = [(f"{r.metrics.threshold:.4g}", f"{r.milliseconds:.2f}", str(r.parameters), str(r.iteration)) for r in runs]
+    return (runs[0].name, *shares, *(", ".join(dict.fromkeys(column)) for column in zip(*each, strict=True)))
 
 
 def read_runs(path: Path, judged: str = "validation") -> list[Run]:
@@ -117,11 +126,13 @@ def _array(arrays: Any, name: str, path: str) -> np.ndarray:
 def text_table(runs: Sequence[Run], judged: str = "validation") -> str:
     """Return the table as text, with the paper's precisions below it; ``judged`` as in ``read_runs``."""
     paper = ", ".join(f"{name} {100 * precision:.1f} %" for name, precision in PAPER)
-    pairs = f"{runs[0].metrics.pairs} {judged} pairs" if runs else "no runs"
+    pairs, nets = f"{runs[0].metrics.pairs} {judged} pairs" if runs else "no runs", by_net(runs)
+    intervals = {net[0].name: ", ".join(f"{name} {text}" for name, text in summary(net).items()) for net in nets}
     return "\n".join(
         [
-            *in_columns([COLUMNS, *(run.cells() for run in runs)]),
+            *in_columns([COLUMNS, *map(_cells, nets)]),
             "",
+            *(f"{name}: {said}; 95 % by bootstrap over pairs" for name, said in intervals.items()),
             f"Judged on {pairs}; threshold of best accuracy on the training pairs; distance: Euclidean.",
             f"The paper's Table I, precision: {paper}.",
         ]
@@ -132,7 +143,7 @@ def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
     """Write ``table.csv``, ``losses.png`` (the paper's Figure 3) and ``distances.png``; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("table.csv", "losses.png", "distances.png")]
-    write_csv(paths[0], COLUMNS, (run.cells() for run in runs))
+    write_csv(paths[0], COLUMNS, map(_cells, by_net(runs)))
     _draw_losses(runs, paths[1])
     _draw_distances(runs, paths[2])
     return paths

@@ -93,7 +93,7 @@ CASES = {
     ),
     "detect": Case(
         loopclosure.cli.main,
-        ["detect", "images", "--describe", THUMBNAILS, "--threshold", "0.5", "--out", "out", "--save", "out/d.npz"],
+        ["detect", "images", "--describe", THUMBNAILS, "--out", "out"],
         detect_inputs,
     ),
 }

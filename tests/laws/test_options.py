@@ -55,7 +55,6 @@ WAYS = {
     "lmdb_build": [
         "walk walk --frames 3 --size 32x24",
         "sheet pairs.txt sheet.png",
-        "join joined.txt pairs.txt pairs.txt",
         "convert ./ pairs.txt db",
         "imageset ./ images.txt db",
         "mean pairs/test_lmdb mean.binaryproto",
@@ -66,10 +65,8 @@ WAYS = {
         "evaluate images:images,truth=truth.png --method thumbnails --exclude-frames 1 --out report",
         "evaluate traverses:images,references=images --method thumbnails --out report",
         "detect walk/walk_1 --describe loopclosure.descriptors.thumbnails:Thumbnailer --exclude-recent 3 --out found",
-        "detect walk/walk_1 --describe loopclosure.descriptors.thumbnails:Thumbnailer --threshold "
-        "-1 --exclude-recent 3 --out found",
-        "detect walk/walk_1 --features walk.npz --threshold -1 --exclude-recent 1 --out found",
-        "detect --video walk.avi --describe loopclosure.descriptors.thumbnails:Thumbnailer --out found",
+        "detect walk/walk_1 --describe walk.npz --exclude-recent 1 --out found",
+        "watch --video walk.avi --describe loopclosure.descriptors.thumbnails:Thumbnailer --out found",
         "close walk/walk_1 --loops loops.csv --drift 2 --out closed",
         "close images --loops loops.csv --odometry odometry.txt --out closed",
         "map build new walk/walk_1,limit=2",

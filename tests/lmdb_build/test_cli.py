@@ -77,15 +77,6 @@ def test_named_sequences_and_shared_frames(walks: Path, tmp_path: Path) -> None:
     assert read_settings(tmp_path / "val.txt")["one frame of reference"] == "walk_1 walk_2"
 
 
-def test_joined(walks: Path) -> None:
-    out = walks / "joined"
-    assert main(pairs(walks, "--out", str(out), "--train", "20", "--val", "10")) == 0
-    assert main(["join", str(out / "all.txt"), str(out / "train.txt"), str(out / "val.txt")]) == 0
-    joined = read_pair_list(out / "all.txt")
-    assert len(joined) == 30
-    assert all((walks / pair.second).is_file() for pair in joined)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -134,7 +125,6 @@ def test_an_invalid_line_of_groundtruth_is_reported(
         "pairs a --out x --max-distance nan",
         "pairs a --out x --max-angle -1",
         "pairs a --out x --seed -1",
-        "join x a --seed -1",
         "sheet a x.png --seed -1",
     ],
 )

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -108,6 +109,21 @@ def test_compare_trains_and_evaluates_the_best_validated_snapshot(
     assert main(["compare", SOLVER, "--out", "out", "--no-train"]) == 1
 
 
+def test_solvers_of_one_net_are_its_seeds(edited: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
+    second = Path(SOLVER).read_text().replace("sgd_step/ref", "sgd_step/second").replace("max_iter: 10", "max_iter: 5")
+    second = second.replace("random_seed: 7", "random_seed: 8")
+    Path("sgd_step/second.prototxt").write_text(second)
+    found = []
+    for solvers in ([SOLVER], ["sgd_step/second.prototxt"], [SOLVER, "sgd_step/second.prototxt"]):
+        assert main(["compare", *solvers, "--snapshot", "last", "--out", "out"]) == 0
+        found.append(row("out"))
+    for column in ("precision", "ROC AUC"):
+        first, other, both = (float(each[column]) for each in found)
+        assert both == pytest.approx((first + other) / 2, abs=1.1e-3)
+    assert found[2]["iteration"] == "10, 5"
+    assert re.search(r"sgd_step: precision [\d.]+ \([\d.]+ to [\d.]+\), recall", capfd.readouterr().out)
+
+
 def test_a_snapshot_without_a_test_is_tested(edited: Callable[..., None]) -> None:
     edited("snapshot: 5", "snapshot: 4", "max_iter: 10", "max_iter: 5")
     assert main(["compare", SOLVER, "--out", "out"]) == 0
@@ -164,8 +180,13 @@ def fault(capfd: pytest.CaptureFixture[str], *words: str) -> str:
 def test_errors_are_one_line(folder: Path, edited: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> None:
     absent = "sgd_step/ref: no snapshot of this net; train it first (without --no-train)"
     assert fault(capfd, "--no-train") == absent
-    twice = 'sgd_step/train_val.prototxt: found a second net named "sgd_step"; give each net its own name'
-    assert fault(capfd, SOLVER) == twice
+    twice = 'found a second training with snapshot_prefix "sgd_step/ref"; give each training its own'
+    assert fault(capfd, SOLVER) == f"{SOLVER}: {twice}"
+    second = Path(SOLVER).read_text().replace("sgd_step/ref", "sgd_step/second").replace("train_val", "other")
+    Path("sgd_step/second.prototxt").write_text(second)
+    shutil.copy("sgd_step/train_val.prototxt", "sgd_step/other.prototxt")
+    twice = 'sgd_step/other.prototxt: found a second net named "sgd_step"; give each net its own name'
+    assert fault(capfd, "sgd_step/second.prototxt") == twice
     edited("base_lr", "base_rl")
     assert 'SolverParameter has no field "base_rl"' in fault(capfd)
 

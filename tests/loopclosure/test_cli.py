@@ -13,9 +13,30 @@ import cv2
 import numpy as np
 import pytest
 
+from lmdb_build.cli import main as lmdb_build_main
+from loopclosure import Thumbnailer, close, detect, evaluate
 from loopclosure.cli import main
-from loopclosure.detector.detector import LoopDetector
+from loopclosure.places.frames import read_bgr
 from paths import ROOT
+
+THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
+
+
+def thumbnail(image: np.ndarray) -> np.ndarray:
+    return Thumbnailer()(image)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A rendered walk of two laps with depth, and a file of features of its images."""
+    folder = tmp_path_factory.mktemp("rendered")
+    words = ["walk", str(folder / "walk"), "--frames", "70", "--size", "80x60", "--depth"]
+    assert lmdb_build_main(words) == 0
+    walk = folder / "walk" / "walk_1"
+    images = sorted((walk / "rgb").iterdir())
+    rows = np.array([thumbnail(read_bgr(path)) for path in images], np.float32)
+    np.savez(folder / "f.npz", features=rows, names=np.array([path.name for path in images]))
+    return walk, folder / "f.npz"
 
 
 @pytest.mark.slow
@@ -57,30 +78,63 @@ def test_evaluate_trains_on_other_images(two_laps, tmp_path, capsys):
     assert "vocabulary" not in summary["methods"][0]["milliseconds_a_frame"]
 
 
-def test_detect_writes_loops_and_a_pose_graph(two_laps, tmp_path, capsys):
-    line = f"detect {two_laps} --metric cosine --threshold 0.9 --exclude-recent 10 --consistency 2 --out {tmp_path}"
-    assert main([*line.split(), "--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]) == 0
-    with (tmp_path / "loops.csv").open() as stream:
-        loops = list(csv.DictReader(stream))
-    assert [(int(r["query_id"]), int(r["match_id"])) for r in loops] == [(i, i - 20) for i in range(22, 40)]
-    assert loops[0]["query_name"] == "rgb/22.png"
-    assert (tmp_path / "loops.g2o").read_text().count("EDGE_SE3:QUAT") == 39
-    assert "18 loops in 40 frames" in capsys.readouterr().out
+def loops_in(path: Path) -> dict[int, int]:
+    with path.open() as stream:
+        return {int(row["query_id"]): int(row["match_id"]) for row in csv.DictReader(stream)}
 
 
-def test_detect_saves_and_resumes(two_laps, two_laps_features, tmp_path, capsys):
-    features = ["--features", str(two_laps_features)]
-    first = ["detect", f"{two_laps},stop=30", "--threshold", "-0.2", "--exclude-recent", "10", *features]
-    assert main([*first, "--save", str(tmp_path / "d.npz"), "--out", str(tmp_path)]) == 0
-    assert "10 loops in 30 frames" in capsys.readouterr().out
-    again = ["detect", f"{two_laps},start=30", "--resume", str(tmp_path / "d.npz"), *features]
-    assert main([*again, "--out", str(tmp_path)]) == 0
-    assert "10 loops in 10 frames" in capsys.readouterr().out
-    with (tmp_path / "loops.csv").open() as stream:
-        assert [int(row["query_id"]) for row in csv.DictReader(stream)] == list(range(20, 40))
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "describe", [THUMBNAILS, "FEATURES", thumbnail], ids=["module:function", "features", "function"]
+)
+def test_detect_is_a_function_and_a_command(describe, rendered, tmp_path, capsys):
+    """Both give the same loops, from the same frames; the command says how many, where the page is, what is next."""
+    walk, features = rendered
+    describe = str(features) if describe == "FEATURES" else describe
+    found = detect(walk, tmp_path / "function", describe=describe, exclude_seconds=5.0)
+    name = f"{__file__}:thumbnail" if callable(describe) else describe
+    words = ["detect", str(walk), "--describe", name, "--exclude-seconds", "5", "--out", str(tmp_path / "command")]
+    assert main(words) == 0
+    for file in ("loops.csv", "loops.g2o"):
+        assert (tmp_path / "command" / file).read_bytes() == (tmp_path / "function" / file).read_bytes()
+    assert {loop.query: loop.match for loop in found.loops} == loops_in(tmp_path / "command" / "loops.csv")
+    assert len(found.loops) > 20
+    (loops, page, following) = capsys.readouterr().out.splitlines()
+    assert loops == f"{len(found.loops)} loops in {len(found.results)} frames: {tmp_path / 'command' / 'loops.csv'}"
+    assert page == f"report: {tmp_path / 'command' / 'report.html'}"
+    assert f"loopclosure close {walk} --loops " in following
+    chosen = (tmp_path / "command" / "chosen.txt").read_text().replace("/command/", "/function/")
+    assert chosen.splitlines() == found.reasons
+    assert "are the same place by their poses (2 m, 15 degrees)" in chosen
 
 
-THUMBNAILS = "loopclosure.descriptors.thumbnails:Thumbnailer"
+@pytest.mark.slow
+def test_close_is_a_function_and_a_command(rendered, tmp_path, capsys):
+    walk, features = rendered
+    detect(walk, tmp_path, describe=features)
+    closed = close(walk, tmp_path / "loops.csv", tmp_path / "function", drift=2.0, seed=3)
+    words = ["close", str(walk), "--loops", str(tmp_path / "loops.csv"), "--drift", "2", "--seed", "3"]
+    assert main([*words, "--out", str(tmp_path / "command")]) == 0
+    for file in ("closed.g2o", "closed.txt", "odometry.txt", "loops.csv"):
+        by_function, by_command = ((tmp_path / door / file).read_text() for door in ("function", "command"))
+        assert by_function == by_command.replace("command", "function")
+    assert f"{closed.accepted.sum()} of {len(closed.loops)} loops used" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_evaluate_is_a_function_and_a_command(two_laps, tmp_path):
+    found = evaluate(two_laps, ["thumbs=thumbnails"], tmp_path / "function", exclude_frames=3, max_angle=30, seed=5)
+    words = ["evaluate", str(two_laps), "--method", "thumbs=thumbnails", "--exclude-frames", "3", "--max-angle", "30"]
+    assert main([*words, "--seed", "5", "--out", str(tmp_path / "command")]) == 0
+    by_function, by_command = (
+        json.loads((tmp_path / door / "report.json").read_text()) for door in ("function", "command")
+    )
+    for report in (by_function, by_command):
+        del report["command"], report["methods"][0]["seconds"], report["methods"][0]["milliseconds_a_frame"]
+    assert by_function == by_command
+    assert by_function["methods"][0]["figures"]["all pairs"] == pytest.approx(
+        found.outcomes[0].measures["all pairs"], abs=1e-5
+    )
 
 
 def drive_that_comes_back(folder: Path) -> Path:
@@ -97,64 +151,49 @@ def drive_that_comes_back(folder: Path) -> Path:
 @pytest.mark.slow
 def test_detect_chooses_the_threshold_automatically(tmp_path, capsys):
     drive = drive_that_comes_back(tmp_path)
-    thumbnails = ["--describe", THUMBNAILS]
-    line = ["detect", str(drive), *thumbnails, "--out", str(tmp_path / "found")]
-    assert main([*line, "--save", str(tmp_path / "d.npz")]) == 0
+    assert main(["detect", str(drive), "--describe", THUMBNAILS, "--out", str(tmp_path / "found")]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 5
-    assert (tmp_path / "found" / "chosen.txt").read_text().splitlines() == printed[1:]
     assert " loops in 200 frames: " in printed[0]
     page = (tmp_path / "found" / "report.html").read_text()
     count = int(printed[0].split()[0])
     assert f"<h1>{count} of 200 frames show a place that was seen before</h1>" in page
     assert (page.count('<div class="pair found">'), page.count('<div class="pair rejected">')) == (7, 3)
-    with (tmp_path / "found" / "loops.csv").open() as stream:
-        loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
-    assert len(loops) > 60
-    assert LoopDetector.load(tmp_path / "d.npz").check is not None  # the frames after it are verified too
-    resumed = ["detect", str(drive), "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]
-    assert main([*resumed, *thumbnails]) == 0
-    assert "decided frame by frame, by their scores and their points" in capsys.readouterr().out
+    for reason in (tmp_path / "found" / "chosen.txt").read_text().splitlines():
+        assert reason in page
+    assert len(loops_in(tmp_path / "found" / "loops.csv")) > 60
 
 
 @pytest.mark.slow
 def test_loops_of_a_drive_that_cannot_be_verified_are_right(tmp_path):
     line = ["detect", str(drive_that_comes_back(tmp_path)), "--describe", THUMBNAILS, "--out", str(tmp_path / "found")]
     assert main(line) == 0
-    with (tmp_path / "found" / "loops.csv").open() as stream:
-        loops = [(int(row["query_id"]), int(row["match_id"])) for row in csv.DictReader(stream)]
-    assert all(abs(query - 100 - match) <= 5 for query, match in loops)
+    loops = loops_in(tmp_path / "found" / "loops.csv")
+    assert all(abs(query - 100 - match) <= 5 for query, match in loops.items())
 
 
-def test_unreadable_images_are_skipped(two_laps, tmp_path, capsys):
-    """Two of forty: loops, map and report have the others; a folder without one image is refused."""
-    folder = tmp_path / "drive"
-    folder.mkdir()
-    for i, path in enumerate(sorted((two_laps / "rgb").iterdir(), key=lambda path: int(path.stem))):
-        (folder / f"{i:02d}.png").write_bytes(b"" if i in (3, 20) else path.read_bytes())
-    describe = ["--describe", "loopclosure.descriptors.thumbnails:Thumbnailer"]
-    line = ["detect", str(folder), *describe, "--metric", "cosine", "--threshold", "0.9", "--exclude-recent", "10"]
-    assert main([*line, "--out", str(tmp_path / "found")]) == 0
+@pytest.mark.slow
+def test_unreadable_images_are_skipped(tmp_path, capsys):
+    """Two of 200: loops, map and report have the others; a folder without one image is refused."""
+    folder = drive_that_comes_back(tmp_path)
+    for number in (3, 140):
+        (folder / f"{number:03d}.png").write_bytes(b"")
+    describe = ["--describe", THUMBNAILS]
+    assert main(["detect", str(folder), *describe, "--out", str(tmp_path / "found")]) == 0
     printed = capsys.readouterr()
-    assert "2 of 40 images cannot be read and are left out: 03.png, 20.png" in printed.err
-    assert " loops in 38 frames" in printed.out
+    assert "2 of 200 images cannot be read and are left out: 003.png, 140.png" in printed.err
+    assert " loops in 198 frames" in printed.out
     with (tmp_path / "found" / "loops.csv").open() as stream:
-        names = {row["query_name"]: row["match_name"] for row in csv.DictReader(stream)}
-    assert names["22.png"] == "02.png"
-    assert names["39.png"] == "19.png"
+        names = {int(row["query_name"][:3]): int(row["match_name"][:3]) for row in csv.DictReader(stream)}
+    assert len(names) > 50
+    assert all(abs(query - 100 - match) <= 5 for query, match in names.items())
     (folder / "only").mkdir()
     (folder / "only" / "0.png").write_bytes(b"no picture")
     assert main(["detect", str(folder / "only"), *describe, "--out", str(tmp_path / "none")]) == 1
     assert "0.png: is not a readable image" in capsys.readouterr().err
 
 
-def loops_in(path):
-    with path.open() as stream:
-        return {int(row["query_id"]): int(row["match_id"]) for row in csv.DictReader(stream)}
-
-
 @pytest.mark.slow
-def test_command_and_functions_give_the_same_result(tmp_path, capsys):
+def test_all_ways_give_the_same_loops(tmp_path, capsys):
     """A camera passes a wall, and a part of it once more: a folder, a list, videos, two traverses, a map."""
     rng = np.random.default_rng(1)
     wall = np.full((128, 1600, 3), 128, np.uint8)
@@ -179,12 +218,12 @@ def test_command_and_functions_give_the_same_result(tmp_path, capsys):
     small = ["--describe", "small"]
     found = {}
     for door, line in {
-        "folder": [str(tmp_path / "drive")],
-        "list": [str(tmp_path / "list.txt")],
-        "mp4": [str(tmp_path / "drive.mp4")],
-        "video": ["--video", str(tmp_path / "drive.mp4")],
+        "folder": ["detect", str(tmp_path / "drive")],
+        "list": ["detect", str(tmp_path / "list.txt")],
+        "mp4": ["detect", str(tmp_path / "drive.mp4")],
+        "video": ["watch", "--video", str(tmp_path / "drive.mp4")],
     }.items():
-        assert main(["detect", *line, *small, "--out", str(tmp_path / door)]) == 0
+        assert main([*line, *small, "--out", str(tmp_path / door)]) == 0
         found[door] = loops_in(tmp_path / door / "loops.csv")
     build = ["map", "build", str(tmp_path / "M"), str(tmp_path / "drive"), *small]
     assert main(build) == 0
@@ -218,9 +257,9 @@ def expanded(line: str, **names: object) -> list[str]:
         ("no judged pair shows the same place", "evaluate LAPS,start=50% --method thumbnails --out OUT"),
         ("test images are training images", "evaluate LAPS --method bow --train LAPS --out OUT"),
         ("NOWHERE.npz: no such file", "evaluate LAPS --method features:NOWHERE.npz --out OUT"),
-        ("cannot be read", "detect NOWHERE --threshold 1 --out OUT"),
-        ("expected module:function", "detect LAPS --threshold 1 --describe nothing --out OUT"),
-        ("FEATURES: cannot be written: Not a directory", "detect LAPS --threshold 0.5 --out FEATURES"),
+        ("cannot be read", "detect NOWHERE --out OUT"),
+        ("expected module:function", "detect LAPS --describe nothing: --out OUT"),
+        ("FEATURES: cannot be written: Not a directory", "detect LAPS --out FEATURES"),
         ("cannot exclude 0 frames, nan s", "evaluate LAPS --exclude-seconds nan --method thumbnails --out OUT"),
     ],
 )
@@ -249,12 +288,7 @@ def test_a_folder_with_poses_but_no_times_of_its_images_says_what_is_missing(tmp
             "evaluate pairs:LAPS --max-angle 60 --method thumbnails --out OUT",
         ),
         ("--exclude-frames cannot", "evaluate LAPS,references=LAPS --exclude-seconds 3 --method thumbnails --out OUT"),
-        ("expected KEY=VALUE", "detect LAPS --threshold 1 --with width --out OUT"),
-        ("--with is for --describe", "detect LAPS --threshold 1 --features FEATURES --with width=8 --out OUT"),
-        ("leave out all others", "detect LAPS --resume OUT --metric cosine --out OUT"),
-        ("--top-k needs --threshold", "detect LAPS --top-k 3 --out OUT"),
-        ("--verify needs --threshold", "detect LAPS --verify --out OUT"),
-        ("--odometry is for a recording", "detect --video LAPS --odometry O --out OUT"),
+        ("--metric is a setting of the saved", "watch --video LAPS --resume OUT --metric cosine --out OUT"),
     ],
 )
 def test_contradictory_options_are_one_line_with_status_2(
@@ -280,7 +314,15 @@ def test_names_that_are_not_utf8_are_escaped(two_laps, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line", ["", "evaluate", "detect x --threshold 1 --least-precision 0.9 --out y", "evaluate --camera front"]
+    "line",
+    [
+        "",
+        "evaluate",
+        "detect x --threshold 1 --out y",
+        "detect x --with width --out y",
+        "watch x --out y",
+        "evaluate --camera front",
+    ],
 )
 def test_wrong_usage_is_status_2(line, capsys):
     assert main(line.split()) == 2
@@ -309,7 +351,7 @@ def test_ctrl_c_is_one_line_with_status_130(two_laps, tmp_path):
     code = """
 import sys
 from loopclosure.cli import main
-sys.exit(main(["detect", "images", "--features", "features.npz", "--out", "out"]))
+sys.exit(main(["detect", "images", "--describe", "features.npz", "--out", "out"]))
 """
     paths = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=paths)

@@ -12,7 +12,6 @@ from lmdb_build.pairs.choose import (
     LEFT_OUT,
     NEGATIVE,
     POSITIVE,
-    Wanted,
     choose_pairs,
     split_by_group,
     split_by_time,
@@ -104,7 +103,7 @@ class TestMask:
         source = MaskSource(folder / "samples_GT.bmp", folder / "samples", folder)
         assert len(source.names) == 84
         assert len(source.positives()) == 228
-        chosen = choose_pairs(source, np.arange(84), Wanted(400), np.random.default_rng(1), "train")
+        chosen = choose_pairs(source, np.arange(84), 400, np.random.default_rng(1), "train")
         assert chosen.labels.sum() == 200
 
 

@@ -181,7 +181,6 @@ def test_a_label_without_any_pair_is_an_error_even_with_at_most(tmp_path: Path) 
         (Plan({"train": 7}), "even, not 7"),
         (Plan({"train": 0}), "no pairs are asked for"),
         (Plan({"train": 2}, seed=-1), "seed"),
-        (Plan({"train": 2}, hard_share=1.5), "--hard-share must be 0 to 1"),
         (Plan({"train": 2, "val": 2}, shares={"train": 1.0, "val": 0.0, "test": 0.0}), "share of val is 0"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Lists of pairs: as files, with hard negatives, joined, reported and drawn."""
+"""Lists of pairs: as files, reported and drawn."""
 
 import os
 from pathlib import Path
@@ -7,19 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from lmdb_build.pairs.build import Plan, Split, build_lists, report
+from lmdb_build.pairs.build import Split, report
 from lmdb_build.pairs.by_list import PlaceSource
-from lmdb_build.pairs.choose import NEGATIVE, Wanted, choose_pairs, hard_negatives
+from lmdb_build.pairs.choose import choose_pairs
 from lmdb_build.pairs.list_file import (
     contact_sheet,
-    join_lists,
     read_pair_list,
     read_settings,
-    root_of,
     write_contact_sheet,
     write_pair_list,
 )
-from loopclosure.descriptors.feature_file import Features
 from loopclosure.errors import InputError
 
 
@@ -91,74 +88,9 @@ class TestFile:
             write_pair_list(tmp_path / "list.txt", [('my "photo".png', "b.png", 1)], {})
 
 
-class TestHardNegatives:
-    def test_hard_negatives_are_the_nearest_negatives(self) -> None:
-        source = ring()
-        # On a line: places 2k and 2k + 1 lie close together, both photographs of a place closer still.
-        line = np.array([2.0 * place - 0.8 * (place % 2) for place in range(30)])
-        features = np.concatenate([line, line + 0.01])[:, None]
-        found = hard_negatives(source, np.arange(60), features, 15)
-        places = np.sort(found % 30, axis=1)
-        assert len(found) == 15
-        assert (source.judge(found[:, 0], found[:, 1]) == NEGATIVE).all()
-        assert (places[:, 1] - places[:, 0] == 1).all()
-        assert (places[:, 0] % 2 == 0).all()
-
-    def test_hard_negatives_are_spread_over_the_images(self) -> None:
-        source = ring()
-        rng = np.random.default_rng(0)
-        features = rng.normal(size=(60, 4))
-        features[:6] *= 1e-3  # six images that a net cannot tell apart
-        found = hard_negatives(source, np.arange(60), features, 40)
-        assert len(np.unique(found)) > 40
-
-    def test_images_of_one_place_have_no_hard_negatives(self) -> None:
-        source = PlaceSource([("a.png", "x"), ("b.png", "x")], [(0, 1)], {})
-        assert len(hard_negatives(source, np.arange(2), np.eye(2), 5)) == 0
-
-    def test_the_share_of_hard_negatives_in_a_list(self, tmp_path: Path) -> None:
-        source = ring()
-        line = np.concatenate([np.arange(30.0), np.arange(30.0)])
-        features = Features(tmp_path / "f.npz", line[:, None].astype(np.float32), list(source.names))
-        for share, near in ((0.0, 5), (1.0, 20)):
-            plan = Plan({"train": 40}, by="group", features=features, hard_share=share)
-            path = build_lists(source, plan, tmp_path, tmp_path / str(share))["train"].path
-            gaps = [
-                abs(int(Path(pair.first).stem) - int(Path(pair.second).stem))
-                for pair in read_pair_list(path)
-                if not pair.label
-            ]
-            assert (sum(gap == 1 for gap in gaps) >= near) if share else (sum(gap == 1 for gap in gaps) < near)
-
-    def test_images_without_features_are_an_error(self, tmp_path: Path) -> None:
-        source = ring()
-        features = Features(tmp_path / "f.npz", np.zeros((1, 2), np.float32), ["a/0.png"])
-        with pytest.raises(InputError, match="has no descriptor of"):
-            build_lists(source, Plan({"train": 4}, by="group", features=features), tmp_path, tmp_path)
-
-
-class TestJoin:
-    def test_joined_lists_keep_every_pair_below_the_common_root(self, tmp_path: Path) -> None:
-        write_pair_list(tmp_path / "x/lists/a.txt", [("1.png", "2.png", 1)] * 3, {"root folder": ".."})
-        write_pair_list(tmp_path / "y/b.txt", [("3.png", "4.png", 0)] * 3, {"root folder": "."})
-        number, root = join_lists([tmp_path / "x/lists/a.txt", tmp_path / "y/b.txt"], tmp_path / "z/all.txt", seed=1)
-        assert (number, root) == (6, tmp_path.resolve())
-        joined = read_pair_list(tmp_path / "z/all.txt")
-        assert sorted((pair.first, pair.second, pair.label) for pair in joined) == [
-            *[("x/1.png", "x/2.png", 1)] * 3,
-            *[("y/3.png", "y/4.png", 0)] * 3,
-        ]
-        assert root_of(tmp_path / "z/all.txt").resolve() == tmp_path.resolve()
-
-    def test_a_root_that_is_not_above_all_is_refused(self, tmp_path: Path) -> None:
-        write_pair_list(tmp_path / "x/a.txt", [("1.png", "2.png", 1)], {})
-        with pytest.raises(InputError, match="not below the root folder"):
-            join_lists([tmp_path / "x/a.txt"], tmp_path / "all.txt", 1, root=tmp_path / "y")
-
-
 def test_the_report_counts_each_kind_and_every_pair() -> None:
     source = ring()
-    chosen = choose_pairs(source, np.arange(60), Wanted(40), np.random.default_rng(0), "train")
+    chosen = choose_pairs(source, np.arange(60), 40, np.random.default_rng(0), "train")
     lines = report(source, Split("train", np.arange(60), chosen)).splitlines()
     assert lines[0].startswith("train: 40 pairs of 60 images, ")
     counts = {line[:46].strip(): int(line[46:]) for line in lines[1:]}

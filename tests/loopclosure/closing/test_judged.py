@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmdb_build.walk.sequence import Walk, write_walk
-from loopclosure.evaluate import Evaluation, judge
+from loopclosure.evaluation import Evaluation, judge
 from loopclosure.methods.base import Images, MethodResult
 from loopclosure.places.datasets import load_sequence
 from loopclosure.places.sequences import read_sequence

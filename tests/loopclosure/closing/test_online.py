@@ -16,7 +16,7 @@ from loopclosure.closing import online
 from loopclosure.closing.close import DEPTH_SIGMAS, ate_rmse_m, drifted, path_of, steps_between, write_closed
 from loopclosure.closing.graph import Solution, solve
 from loopclosure.closing.measure import CHECK, Loop
-from loopclosure.closing.online import STILL, UNKNOWN, Keyframes, LoopCloser, after
+from loopclosure.closing.online import STILL, UNKNOWN, LoopCloser, after
 from loopclosure.closing.relative import METRIC, ROTATION_ONLY, Relative
 from loopclosure.closing.synchronizer import Synchronizer
 from loopclosure.descriptors.thumbnails import Thumbnailer
@@ -246,7 +246,7 @@ def picture(seed: int) -> np.ndarray:
 
 
 def test_keyframes_are_apart_by_a_step_or_a_turn() -> None:
-    closer = closer_of(keyframes=Keyframes(step_m=1.0, turn_rad=np.radians(30)))
+    closer = closer_of(step_m=1.0, turn_rad=np.radians(30))
     for second, pose in enumerate((at(0), at(0.9), at(1.1), at(1.1, 29), at(1.1, 31))):
         closer.add(picture(second), second, pose)
     assert closer.path()[0].tolist() == [0, 2, 4]

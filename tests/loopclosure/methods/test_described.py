@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from loopclosure.errors import InputError
-from loopclosure.evaluate import evaluate
+from loopclosure.evaluation import evaluate
 from loopclosure.methods.named import make_method, named_methods
 from loopclosure.places.datasets import load_sequence
 from loopclosure.places.sequences import read_sequence

@@ -180,22 +180,24 @@ def test_unreadable_sources_are_reported(source: str, sentence: str, camera) -> 
 
 
 @pytest.mark.slow
-def test_detect_watches_a_video(tmp_path, capsys) -> None:
+def test_watch_reads_a_video_and_goes_on_with_another(tmp_path, capsys) -> None:
     """A drive past 12 places at one per second, and past them again."""
     video = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 1, (160, 120))
     walls = [np.random.default_rng(i).integers(0, 256, (15, 20, 3)).astype(np.uint8) for i in range(12)]
     for wall in [*walls, *walls[:4]]:
         video.write(cv2.resize(wall, (160, 120), interpolation=cv2.INTER_NEAREST))
     video.release()
-    line = ["detect", "--video", str(tmp_path / "v.avi"), "--exclude-recent", "5", *THUMBNAILS]
-    assert main([*line, "--out", str(tmp_path / "out"), "--save", str(tmp_path / "d.npz")]) == 0
+    line = ["watch", "--video", str(tmp_path / "v.avi"), *THUMBNAILS]
+    assert (
+        main([*line, "--exclude-recent", "5", "--out", str(tmp_path / "out"), "--save", str(tmp_path / "d.npz")]) == 0
+    )
     said = capsys.readouterr().out.splitlines()
     assert said[:4] == [f"frame {12 + i}, {12 + i}.0 s: shows the place of frame {i}" for i in range(4)]
     with (tmp_path / "out" / "loops.csv").open(encoding="utf-8") as table:
         first = next(csv.DictReader(table))
     assert (first["query_name"], first["match_name"]) == ("frame 12", "frame 0")
-    assert main(["detect", *THUMBNAILS, "--out", str(tmp_path)]) == 2
-    assert "expected the frames, or --video" in capsys.readouterr().err
+    assert main([*line, "--resume", str(tmp_path / "d.npz"), "--out", str(tmp_path / "again")]) == 0
+    assert "loops in 16 frames" in capsys.readouterr().out
 
 
 def test_ctrl_c_ends_a_stream_and_keeps_results(camera, tmp_path, monkeypatch) -> None:
@@ -209,7 +211,7 @@ def test_ctrl_c_ends_a_stream_and_keeps_results(camera, tmp_path, monkeypatch) -
         return image.reshape(-1)
 
     monkeypatch.setattr("loopclosure.detector.describers._entry_point", lambda name: lambda: describe)
-    assert main(["detect", "--video", "0", "--out", str(tmp_path), "--save", str(tmp_path / "d.npz")]) == 130
+    assert main(["watch", "--video", "0", "--out", str(tmp_path), "--save", str(tmp_path / "d.npz")]) == 130
     assert (tmp_path / "loops.csv").is_file()
     with np.load(tmp_path / "d.npz") as saved:
         assert len(saved["rows"]) == 4

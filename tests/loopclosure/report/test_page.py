@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from given_scores import GivenScores
-from loopclosure.evaluate import Judgment, Outcome, evaluate
+from loopclosure.evaluation import Judgment, Outcome, evaluate
 from loopclosure.methods.named import named_methods
 from loopclosure.places.datasets import load_sequence, load_traverses
 from loopclosure.places.sequences import read_sequence

@@ -9,7 +9,7 @@ import pytest
 
 from given_scores import GivenScores
 from loopclosure.errors import InputError
-from loopclosure.evaluate import WIDE, evaluate
+from loopclosure.evaluation import WIDE, evaluate
 from loopclosure.methods.auto import Auto
 from loopclosure.methods.base import MethodContext
 from loopclosure.methods.features import FeatureMethod
