@@ -86,8 +86,10 @@ class Engine:
             return None
 
     def _open(self) -> Model:
-        keep = self.is_stored or self._build()[1]
-        self._model = Model(self._choice, self._key if keep else "", self._export)
+        key = self._key if self.is_stored or self._build()[1] else ""
+        if not self._warn and not (key and self._choice.cache):
+            raise Unable("its model cannot be kept, and each start would take seconds to export it")
+        self._model = Model(self._choice, key, self._export)
         with suppress(OSError):
             self._passed.update((self._model.folder / SHAPES).read_text("utf-8", "replace").splitlines())
         return self._model
