@@ -238,6 +238,39 @@ def _variants() -> dict[str, Case]:
             "DummyData", layer("DummyData", "", "y", "dummy_data_param { shape { dim: 2 } data_filler { value: 3 } }")
         ),
     }
+    # Values at which a formula has a limit of Caffe's, or its gradient is not a number.
+    flat, tie = np.ones((2, 4, 3, 3)), given("x", 2, 4) + given("z", 2, 4)
+    maps = given("x", 2, 4, 3, 3)
+    found |= {
+        "BatchNorm of six axes": _case("BatchNorm", given("x", 2, 2, 1, 2, 1, 2) + layer("BatchNorm", "x", "y")),
+        "BatchNorm of one value": _case("BatchNorm", given("x", 1, 4) + layer("BatchNorm", "x", "y")),
+        "BatchNorm of nearly equal values": _case(
+            "BatchNorm",
+            maps + layer("BatchNorm", "x", "y", "batch_norm_param { scale_bias: true eps: 1e-9 }"),
+            "nvidia",
+            x=1e-4 * MAPS,
+        ),
+        "MVN of a constant": _case("MVN", maps + layer("MVN", "x", "y"), x=flat),
+        "Eltwise MAX of equal values": _case(
+            "Eltwise", tie + layer("Eltwise", "x z", "y", "eltwise_param { operation: MAX }"), x=VECTORS, z=VECTORS
+        ),
+        "ContrastiveLoss of equal values": _case(
+            "ContrastiveLoss",
+            tie + given("y", 2) + layer("ContrastiveLoss", "x z y", "loss"),
+            x=VECTORS,
+            z=VECTORS,
+            y=np.zeros(2),
+        ),
+        "SoftmaxWithLoss of a probability of 0": _case(
+            "SoftmaxWithLoss",
+            given("x", 1, 2) + given("y", 1) + layer("SoftmaxWithLoss", "x y", "loss"),
+            x=np.array([[0, -200]]),
+            y=np.ones(1),
+        ),
+        "Normalize with lengths": _case(
+            "Normalize", given("x", 2, 4) + layer("Normalize", "x", "y length"), "happynear", x=VECTORS
+        ),
+    }
     for name, settings in losses.items():
         text = OF_SCORES + layer("SoftmaxWithLoss", "x y", "loss p", settings)
         found[f"SoftmaxWithLoss {name}"] = _case("SoftmaxWithLoss", text, **scored)

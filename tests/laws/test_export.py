@@ -291,7 +291,7 @@ def statements(case: Case, phase: PhaseValue) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cases", together(), ids=lambda cases: f"{cases[0].dialect} {cases[0].kind}".strip())
+@pytest.mark.parametrize("cases", list(together()), ids=lambda cases: f"{cases[0].dialect} {cases[0].kind}".strip())
 def test_onnx_models_of_layers_compute_the_same(
     cases: Sequence[Case],
     folder: Path,  # noqa: F811

@@ -22,7 +22,7 @@ from netspec.files.whole_file import whole_folder
 from netspec.proto.forks import forks
 
 DIGESTS = "digests.json"  # of the files of an entry, by name
-EXPORTER = 3  # another number wherever exported models change between versions
+EXPORTER = 4  # another number wherever exported models change between versions
 
 
 def key_of(files: Sequence[str | Path], options: Mapping[str, Any]) -> str:

@@ -132,7 +132,7 @@ class _Writer:
             options = {"opset_version": OPSET, "custom_translation_table": translations()}
             program = torch.onnx.export(traced, dynamo=True, optimize=False, verbose=False, **options)
             self._set_ends(program.model.graph)
-            program.optimize()
+            _simplify(program.model)
         model = program.model
         model.graph.outputs.extend(x for x in model.graph.inputs if x.name in self.outputs.keys() & self.given.keys())
         _pad_pixels(model.graph)
@@ -243,6 +243,41 @@ class _Writer:
                 value.metadata_props.clear()
                 if id(value) not in ends:
                     value.shape = None
+
+
+def _simplify(model: Any) -> None:
+    """Fold constants, and BatchNorm into filters; remove what has no effect.
+
+    ``ONNXProgram.optimize`` has more rules. One takes x + 1e-9, as in MVN, for x.
+    """
+    from onnx_ir.passes import Sequential, common
+    from onnxscript.optimizer import fold_constants_ir
+    from onnxscript.rewriter import rewrite
+    from onnxscript.rewriter.rules import common as rules
+
+    fold_constants_ir(model)
+    rewrite(
+        model,
+        [
+            rules.fuse_batchnorm_into_conv_rule,
+            rules.fuse_batchnorm_into_conv_transpose_rule,
+            rules.fuse_batchnorm_into_gemm_rule,
+            rules.no_op_cast_rule,
+            rules.no_op_expand_rule,
+            rules.no_op_transpose_rule,
+            rules.reshape_reshape_rule,
+            rules.materialize_reshape_shape_rule,
+        ],
+    )
+    fold_constants_ir(model)
+    Sequential(
+        common.RemoveUnusedNodesPass(),
+        common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        common.DeduplicateInitializersPass(),
+        common.CommonSubexpressionEliminationPass(),
+        common.OutputFixPass(),
+        common.NameFixPass(),
+    )(model)
 
 
 def _pad_pixels(graph: Any) -> None:
