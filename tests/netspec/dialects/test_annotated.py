@@ -79,14 +79,6 @@ def test_label_of_records_without_a_type_is_that_of_the_datum(tmp_path: Path) ->
     assert batch_of(reading(source, more="anno_type: BBOX"))[1].shape == (1, 1, 3, 8)
 
 
-def test_resize_mode_warp_keeps_the_relative_boxes(tmp_path: Path) -> None:
-    image = noise(9, 15)
-    layer = reading(write(tmp_path, annotated(image, OBJECTS)), "resize_param { height: 6 width: 6 }")
-    data, label = batch_of(layer)
-    np.testing.assert_array_equal(data[0], cv2.resize(image, (6, 6)).transpose(2, 0, 1))
-    np.testing.assert_allclose(label[0, 0, :, 3:7], [box for _, box, _ in OBJECTS], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("height", "width", "inner"), [(10, 20, (15, 30)), (20, 10, (30, 15))], ids=["landscape", "portrait"]
 )
@@ -119,14 +111,6 @@ def test_resize_mode_fit_small_size_scales_boxes_by_height_scale_and_width_scale
     np.testing.assert_allclose(label[0, 0, :, 3:7], [box for _, box, _ in OBJECTS], atol=1e-6)
     scaled = batch_of(reading(source, resize % "height_scale: 16 width_scale: 32"))[1]
     np.testing.assert_allclose(scaled[0, 0, :, 3:7], np.array([box for _, box, _ in OBJECTS]) / 2, atol=1e-6)
-
-
-def test_crop_clips_boxes_and_drops_those_outside(tmp_path: Path) -> None:
-    boxes = [(1, (0.0, 0.0, 0.5, 0.5), False), (2, (0.0, 0.0, 0.2, 0.2), False)]
-    image = noise(20, 40)
-    data, label = batch_of(reading(write(tmp_path, annotated(image, boxes)), "crop_h: 10 crop_w: 20"))
-    np.testing.assert_array_equal(data[0], image[5:15, 10:30].transpose(2, 0, 1))
-    np.testing.assert_allclose(label[0, 0], [(0, 1, 0, 0, 0, 0.5, 0.5, 0)], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -55,13 +55,6 @@ def fresh_files() -> Iterator[None]:
 # ---- A file of the user ----
 
 
-@pytest.mark.slow
-def test_a_program_may_begin_with_a_dialect(fork: Path) -> None:
-    code = "import sys, netspec; netspec.use_dialect(sys.argv[1]); print(netspec.load_net(sys.argv[2]).shapes)"
-    command = [sys.executable, "-c", code, str(fork), str(fork.with_name("net.prototxt"))]
-    assert "y" in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-
-
 def test_the_documented_example_works_in_commands(fork: Path, capsys: pytest.CaptureFixture[str]) -> None:
     net = str(fork.with_name("net.prototxt"))
     assert main(["check", net]) == 1

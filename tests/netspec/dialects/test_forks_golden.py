@@ -1,7 +1,7 @@
 """Results of the forks themselves: single layers, and trainings of nets with them.
 
 tests/golden/forks/README.md says which forks, how they were built, and where a fork is odd. Their oddities are
-repeated, but for the faults listed below. Each case agrees, is refused by a message that says why, or is such a fault.
+repeated, but for the faults listed below. Each case agrees or is such a fault.
 """
 
 import json
@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from fresh_dialects import fresh_dialects
 from golden_cases import LayerCase, layer_distances, parameters, set_parameters, train
 from netspec import use_dialect
 from netspec.dialects import known
-from netspec.errors import SpecError
 from paths import GOLDEN, ROOT
 
 FORKS = GOLDEN / "forks"
@@ -48,27 +46,12 @@ NAMED = {
     "rcf__sigmoid_loss_three": "rcf",
     "normalize_nothing_tsn": "tsn",
 }
-# Cases that a message refuses: a part of the message.
-REFUSED: dict[str, str] = {}
-# Cases that should agree and do not yet, refused or different. Remove a row once its case agrees: its test then fails.
-OPEN: list[str] = []
-
-
-def cases(folder: str) -> list[Any]:
-    """Return the names of the cases in a folder; those of OPEN must fail."""
-    names = sorted(path.name for path in (FORKS / folder).iterdir())
-    failing = pytest.mark.xfail(strict=True, raises=(SpecError, AssertionError))
-    return [pytest.param(name, marks=failing if name in OPEN else ()) for name in names]
 
 
 def check(name: str, compared: Callable[[], dict[str, float]]) -> None:
-    """Check that a case agrees, is refused as REFUSED says, or differs by a fault of the fork's."""
+    """Check that a case agrees, or differs by a fault of the fork's."""
     if name in NAMED:
         use_dialect(NAMED[name])
-    if name in REFUSED:
-        with pytest.raises(SpecError, match=re.escape(REFUSED[name])):
-            compared()
-        return
     off = {key: f"{value:.1e}" for key, value in compared().items() if value > CLOSE}
     assert bool(off) == (name in FAULTS), off or "agrees; remove it from FAULTS"
 
@@ -92,13 +75,13 @@ def difference(found: np.ndarray, golden: np.ndarray, key: str) -> float:
     return float(np.nanmax(np.abs(found - golden), initial=0)) / scale
 
 
-@pytest.mark.parametrize("name", cases("layers"))
+@pytest.mark.parametrize("name", sorted(os.listdir(FORKS / "layers")))
 def test_layer_equals_the_forks_results(name: str) -> None:
     check(name, lambda: differences(LayerCase(FORKS / "layers" / name)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", cases("training"))
+@pytest.mark.parametrize("name", sorted(os.listdir(FORKS / "training")))
 def test_training_follows_the_fork(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(FORKS / "training" / name, tmp_path / name)
     monkeypatch.chdir(tmp_path / name)
@@ -118,8 +101,7 @@ def test_layer_of_an_unknown_fork_gets_a_warning(
 
 
 def test_the_tables_contain_existing_cases_only() -> None:
-    names = {path.name for folder in ("layers", "training") for path in (FORKS / folder).iterdir()}
-    assert {*FAULTS, *REFUSED, *NAMED, *OPEN} <= names
+    assert {*FAULTS, *NAMED} <= {*os.listdir(FORKS / "layers"), *os.listdir(FORKS / "training")}
 
 
 def training_differences() -> dict[str, float]:
@@ -156,7 +138,7 @@ def table(monkeypatch: pytest.MonkeyPatch, margin: float = 1) -> list[tuple[str,
     forks: dict[str, list[str]] = {}
     for folder, fork in golden_cases():
         name, case = folder.name, LayerCase(folder)
-        if name in (*OPEN, *REFUSED, *FAULTS):
+        if name in FAULTS:
             continue
         kind = re.findall(r'layer \{[^{]*?type: "(\w+)"', (folder / "net.prototxt").read_text())[-1]
         monkeypatch.chdir(GOLDEN / "ssd")  # name_size.txt

@@ -50,19 +50,6 @@ def layer_of(build: Build, settings: dict[str, Any], given: list[torch.Tensor], 
     return build("ssd", param, *(b.shape for b in given), phase=0)
 
 
-def test_a_batch_without_true_boxes_has_no_loss_and_no_gradient(build: Build) -> None:
-    given = bottoms(*random_predictions(), TRUTH[-1:])
-    for settings in ({}, {"mining_type": "HARD_EXAMPLE"}):
-        loc, conf = (g.clone().requires_grad_() for g in given[:2])
-        (loss,) = layer_of(build, settings, given).run(loc, conf, *given[2:])
-        assert loss == 0
-        loss.backward()
-        assert loc.grad is not None
-        assert conf.grad is not None
-        assert not loc.grad.any()
-        assert not conf.grad.any()
-
-
 def test_losses_with_propagate_down_false_are_left_out(build: Build) -> None:
     given = bottoms(*random_predictions(), TRUTH)
     down = "propagate_down: {} propagate_down: {} propagate_down: false propagate_down: false"
@@ -72,27 +59,6 @@ def test_losses_with_propagate_down_false_are_left_out(build: Build) -> None:
     assert boxes > 0
     assert confidences > 0
     torch.testing.assert_close(boxes + confidences, both)
-
-
-def test_gradient_is_not_divided_by_a_variance_encoded_in_the_target(build: Build) -> None:
-    given = bottoms(*random_predictions(), TRUTH)
-    settings = {"encode_variance_in_target": True, "loc_loss_type": "SMOOTH_L1", "conf_loss_type": "SOFTMAX"}
-    loc = given[0].clone().requires_grad_()
-    layer_of(build, settings, given, "loss_param { normalization: NONE }").run(loc, *given[1:])[0].backward()
-    assert loc.grad is not None
-    assert loc.grad.abs().max() == 1  # where |d| > 1; 1 / 0.25 at least if it were divided
-
-
-def test_map_object_to_agnostic_makes_all_labels_one_class(build: Build) -> None:
-    loc, conf, priors, variances = random_predictions()
-    given = bottoms(loc, conf[..., :2], priors, variances, TRUTH)
-    text = "type: 'MultiBoxLoss' multibox_loss_param { num_classes: 2 map_object_to_agnostic: true }"
-    (loss,) = build("ssd", text, *(b.shape for b in given)).run(*given)
-    relabeled = [(t[0], min(t[1], 1), *t[2:]) for t in TRUTH]
-    (expected,) = build(
-        "ssd", "type: 'MultiBoxLoss' multibox_loss_param { num_classes: 2 }", *(b.shape for b in given)
-    ).run(*bottoms(loc, conf[..., :2], priors, variances, relabeled))
-    assert loss == expected
 
 
 def test_hard_examples_that_overlap_one_of_larger_loss_are_suppressed(build: Build) -> None:

@@ -33,13 +33,6 @@ def test_the_first_of_equal_pixels_gets_the_gradient_of_roi_pooling(build: Build
     assert maps.grad[0, 0].tolist() == [[1, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 0]]
 
 
-def test_a_pixel_can_belong_to_two_bins_of_roi_pooling(build: Build) -> None:
-    maps = torch.arange(3.0).reshape(1, 1, 1, 3).requires_grad_()
-    layer = build("rcnn", "type: 'ROIPooling' roi_pooling_param { pooled_h: 1 pooled_w: 2 }", maps.shape, (1, 5))
-    (top,) = layer.run(maps, torch.tensor([[0.0, 0, 0, 2, 0]]))
-    assert top.flatten().tolist() == [1, 2]
-
-
 @pytest.mark.parametrize(("dialect", "kind"), [("rcnn", "ROIPooling"), ("rfcn", "PSROIPooling")])
 def test_regions_of_a_missing_image_are_refused(build: Build, dialect: str, kind: str) -> None:
     settings = {
@@ -137,20 +130,3 @@ def test_regions_of_four_columns_are_refused_in_the_forward_pass(build: Build) -
     )
     with pytest.raises(SpecError, match=r"found regions of shape \(1, 4\), expected \(R, 5\)"):
         layer.run(torch.zeros(1, 3, 8, 8), torch.zeros(1, 4))
-
-
-def regions_of(images: list[int]) -> torch.Tensor:
-    return torch.tensor([[float(image), 0, 0, 5, 5] for image in images])
-
-
-def test_box_annotator_ohem_keeps_the_hardest_regions_of_each_image(build: Build) -> None:
-    regions, losses = regions_of([0, 1, 0, 1, 0]), torch.tensor([0.5, 3, 0.75, 1, 0.25]).reshape(5, 1, 1, 1)
-    labels, weights = torch.tensor([4.0, 3, 2, 1, 0]), torch.arange(10.0).reshape(5, 2)
-    text = "type: 'BoxAnnotatorOHEM' box_annotator_ohem_param { roi_per_img: %d ignore_label: -1 }"
-    layer = build("rfcn", text % 1, (5, 5), (5, 1, 1, 1), (5,), (5, 2), tops=2)
-    kept, chosen = layer.run(regions, losses, labels, weights)
-    assert kept.flatten().tolist() == [-1, 3, 2, -1, -1]
-    assert chosen.reshape(5, 2).tolist() == [[0, 0], [2, 3], [4, 5], [0, 0], [0, 0]]
-    assert layer.top_shapes == [(5, 1, 1, 1), (5, 2, 1, 1)] == [tuple(kept.shape), tuple(chosen.shape)]
-    layer = build("rfcn", text % 2, (5, 5), (5, 1, 1, 1), (5,), (5, 2), tops=2)
-    assert layer.run(regions, losses, labels, weights)[0].flatten().tolist() == [4, 3, 2, 1, -1]

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from fresh_dialects import used_by
 from netspec import use_dialect
 from netspec.errors import SpecError
 from netspec.layers import Context, Layer
-from netspec.net.build import build_net
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TRAIN
-from netspec.proto.text import parse_net_text
 
 Build = Callable[..., Layer]
 
@@ -101,13 +98,6 @@ def test_values_below_127_in_edge_maps_are_zero_for_hed_and_kept_for_rcf(pairs: 
     gray = images[:, :1] + 1
     below = torch.zeros_like(gray) if dialect == "hed" else gray / 255
     assert torch.equal(labels, torch.where(gray > 127, 1, below))
-
-
-def test_a_layer_type_of_hed_and_rcf_is_refused_with_the_options_to_give(pairs: Path) -> None:
-    text = EDGES % (pairs, pairs)
-    assert used_by(text) == []
-    with pytest.raises(SpecError, match='dialects "hed" and "rcf" have "ImageLabelmapData"; add --plugin hed'):
-        build_net(*parse_net_text(text, "net.prototxt"))
 
 
 def test_segnets_bn_has_tops_for_mean_and_variance_of_the_batch(build: Build) -> None:

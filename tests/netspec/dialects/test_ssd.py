@@ -25,20 +25,6 @@ Build = Callable[..., Layer]
 # ---- Permute, Normalize ----
 
 
-def test_the_gradient_of_normalize_leaves_the_scales_out_of_the_sum(build: Build) -> None:
-    """The fork's gradient with a scale for each channel (normalize_layer.cpp), which every SSD300 was trained with."""
-    text = "norm_param { across_spatial: false channel_shared: false scale_filler { type: 'uniform' min: 2 max: 9 } }"
-    x, dy = torch.randn(2, 3, 4, 5, requires_grad=True), torch.randn(2, 3, 4, 5)
-    layer = build("ssd", f"type: 'Normalize' {text}", tuple(x.shape))
-    layer.run(x)[0].backward(dy)
-    scale = layer.blobs[0].detach()[:, None, None]
-    plain = x.detach().requires_grad_()
-    (plain / (plain.square().sum(1, keepdim=True) + 1e-10).sqrt()).backward(dy)
-    assert x.grad is not None
-    assert plain.grad is not None
-    torch.testing.assert_close(x.grad, plain.grad * scale)
-
-
 def test_normalize_scale_is_initialized_to_one(build: Build) -> None:
     assert build("ssd", "type: 'Normalize'", (2, 3, 4, 5)).blobs[0] == 1
 

@@ -6,6 +6,7 @@ priors (multibox_logistic_none), and equal scores come in the order of std::sort
 (test_equal_scores_come_in_the_order_of_std_sort).
 """
 
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 import netspec
 from golden_cases import LayerCase, assert_same_layers, parameters, train
+from netspec.cli import main
 from netspec.dialects.boxes import highest
 from netspec.load import load_net
 from paths import GOLDEN
@@ -80,6 +82,23 @@ def test_mean_average_precision_is_logged_as_by_ssds_branch(
     said = [record.getMessage().strip() for record in caplog.records]
     for line in (SSD / "training" / variant / f"eval_{version}.log").read_text().splitlines():
         assert line.strip() in said
+
+
+@pytest.mark.slow
+def test_commands_report_the_mean_average_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _lay_out("corner_no_mining", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    weights = ["--weights", "corner_no_mining/longer.caffemodel", "--plugin", "ssd"]
+    solver = "corner_no_mining/eval_Integral.prototxt"
+    assert main(["train", "--solver", solver, *weights, "--scores", "scores.json"]) == 0
+    (test,) = json.loads(Path("scores.json").read_text())["tests"]
+    assert main(["test", "--model", "corner_no_mining/test.prototxt", *weights, "--iterations", "5"]) == 0
+    said = capsys.readouterr().err
+    assert f"caffe.cpp:321] detection_eval = {test['outputs']['detection_eval'][0]:.6g}\n" in said
+    assert "Batch 0, detection_eval" not in said
+    assert "has no effect" not in said
 
 
 def test_equal_scores_come_in_the_order_of_std_sort() -> None:

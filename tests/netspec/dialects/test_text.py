@@ -13,14 +13,6 @@ Build = Callable[..., Layer]
 STEPS, ITEMS, CLASSES = 4, 2, 3
 
 
-def test_ctc_loss_of_a_text_longer_than_its_sequence_is_zero(build: Build) -> None:
-    scores = torch.randn(2, 1, CLASSES, requires_grad=True)
-    layer = build("text", "type: 'WarpCTCLoss'", scores.shape, (1, 2))
-    (loss,) = layer.run(scores, torch.tensor([[1.0, 1.0]]))  # it needs a blank between
-    assert loss.item() == 0
-    assert not torch.autograd.grad(loss, scores)[0].any()
-
-
 def test_ctc_loss_is_equal_for_all_forms_of_its_bottoms(build: Build) -> None:
     """Two bottoms: labels from 1. Three: labels from 0, with indicators. Four: labels from 1, with lengths."""
     scores = torch.randn(STEPS, ITEMS, CLASSES)
@@ -51,15 +43,6 @@ def test_greedy_decoder_merges_repeated_labels_and_removes_blanks(
     assert layer.run(SCORES)[0].reshape(2, 4).tolist() == [text + [-1] * (4 - len(text)) for text in texts]
 
 
-def test_accuracy_of_decoded_texts(build: Build) -> None:
-    labels = torch.tensor([[1.0, 1, 0], [1, 1, 0]])
-    layer = build("text", "type: 'CTCGreedyDecoder'", SCORES.shape, labels.shape)
-    assert layer.run(SCORES, labels)[0].flatten().tolist() == [0.75, 0.5]
-    scores = SCORES.transpose(0, 1)
-    layer = build("text", "type: 'LabelsequenceAccuracy'", scores.shape, labels.shape)
-    assert layer.run(scores, labels)[0].item() == 0.5
-
-
 def test_edit_distance_equals_known_values(build: Build) -> None:
     build("text", "type: 'Reverse'", (1,))
     edit_distance = sys.modules["netspec.dialects.text.ctc"].edit_distance
@@ -69,21 +52,6 @@ def test_edit_distance_equals_known_values(build: Build) -> None:
         0,
         2,
     ]
-
-
-def test_continuation_indicator_is_zero_in_the_first_step_only(build: Build) -> None:
-    text = "type: 'ContinuationIndicator' continuation_indicator_param { time_step: 3 batch_size: 2 }"
-    assert build("text", text).run()[0].tolist() == [[0, 0], [1, 1], [1, 1]]
-
-
-@pytest.mark.parametrize(("copies", "rest"), [("true", [5, 7, 9]), ("false", [0, 0, 0])], ids=["copied", "zero"])
-def test_reverse_time_reverses_the_first_steps_of_each_sequence(build: Build, copies: str, rest: list[int]) -> None:
-    data = torch.arange(10.0).reshape(5, 2, 1)
-    layer = build("text", f"type: 'ReverseTime' reverse_time_param {{ copy_remaining: {copies} }}", data.shape, (2,))
-    (top,) = layer.run(data, torch.tensor([5.0, 2]))
-    assert top[:, 0, 0].tolist() == [8, 6, 4, 2, 0]
-    assert top[:2, 1, 0].tolist() == [3, 1]
-    assert top[2:, 1, 0].tolist() == rest
 
 
 def test_reverse_time_sets_nan_and_infinity_behind_a_sequence_to_zero(build: Build) -> None:
