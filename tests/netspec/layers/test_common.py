@@ -8,7 +8,7 @@ import torch
 
 from netspec.errors import SpecError
 from netspec.fast.fused import vector_product
-from netspec.proto.schema import TEST, TRAIN
+from netspec.proto.schema import TRAIN
 
 FILL = 'weight_filler { type: "gaussian" } bias_filler { type: "gaussian" }'
 
@@ -82,26 +82,9 @@ def test_dropout_masks_do_not_depend_on_the_layout(build) -> None:
     assert torch.equal(one, other)
 
 
-def test_dropout_changes_nothing_in_the_test_phase(build) -> None:
-    data = torch.randn(3, 4)
-    assert torch.equal(build('type: "Dropout"', (3, 4), phase=TEST).run(data)[0], data)
-
-
 def test_the_phase_of_a_layer_overrides_the_nets(build) -> None:
     data = torch.ones(10, 100)
     assert torch.equal(build('type: "Dropout" phase: TEST', data.shape, phase=TRAIN).run(data)[0], data)
-
-
-def test_embed_looks_rows_up_and_adds_up_their_gradients(build) -> None:
-    layer = build(f'type: "Embed" embed_param {{ num_output: 3 input_dim: 5 {FILL} }}', (2, 4))
-    index = torch.tensor([[0, 4, 2, 2], [1, 2, 0, 4]])
-    rows, bias = layer.blobs
-    (top,) = layer.run(index.float())
-    assert layer.top_shapes == [(2, 4, 3)]
-    torch.testing.assert_close(top, rows[index] + bias)
-    top.backward(torch.ones_like(top))
-    assert rows.grad[:, 0].tolist() == [2, 1, 3, 0, 2]
-    assert bias.grad.tolist() == [8, 8, 8]
 
 
 def test_embed_without_bias_accepts_another_shape(build) -> None:

@@ -70,22 +70,6 @@ def test_batch_norm_without_statistics_divides_by_the_root_of_eps(build) -> None
     torch.testing.assert_close(layer.run(data)[0], data / 0.2)
 
 
-def test_batch_norm_layers_with_shared_sums_update_them_in_order(build) -> None:
-    text = 'type: "BatchNorm" batch_norm_param { moving_average_fraction: 0.5 }'
-    first, second = (build(text, (4, 2), phase=TRAIN) for _ in range(2))
-    for i in range(3):
-        second.blobs[i] = first.blobs[i]
-    a, b = (torch.randn(4, 2, requires_grad=True) for _ in range(2))
-    tops = (first.run(a)[0], second.run(b)[0])
-    torch.testing.assert_close(tops[1], normalized(b.detach()), atol=2e-6, rtol=1e-6)  # each by its own batch
-    expected = 0.5 * statistics(a.detach())[0] + statistics(b.detach())[0]
-    torch.testing.assert_close(first.blobs[0].detach(), expected.float())
-    assert first.blobs[2].item() == 1.5
-    torch.autograd.backward(tops, [torch.randn(4, 2), torch.randn(4, 2)])
-    assert a.grad is not None
-    assert all(blob.grad is None for blob in first.blobs)
-
-
 def test_batch_norm_of_one_value_per_channel_has_variance_zero(build) -> None:
     layer = build('type: "BatchNorm"', (1, 3), phase=TRAIN)
     data = torch.randn(1, 3, requires_grad=True)
@@ -97,20 +81,6 @@ def test_batch_norm_of_one_value_per_channel_has_variance_zero(build) -> None:
     assert torch.equal(layer.blobs[0].detach(), data.detach()[0])
     assert layer.blobs[1].tolist() == [0, 0, 0]  # m / (m - 1) is 1 for m = 1
     assert layer.blobs[2].item() == 1
-
-
-def test_batch_norm_gradient_with_global_stats_is_divided_by_the_deviation(build) -> None:
-    layer = build('type: "BatchNorm" batch_norm_param { use_global_stats: true }', (4, 2, 3), phase=TRAIN)
-    for blob, values in zip(layer.blobs, ([2.0, 4.0], [8.0, 18.0], [2.0]), strict=True):
-        blob.data = torch.tensor(values)
-    data = torch.randn(4, 2, 3, requires_grad=True)
-    (top,) = layer.run(data)
-    diff = torch.randn(4, 2, 3)
-    top.backward(diff)
-    deviation = torch.tensor([4 + 1e-5, 9 + 1e-5]).sqrt().reshape(1, 2, 1)
-    torch.testing.assert_close(top, (data - torch.tensor([[[1.0], [2.0]]])) / deviation)
-    torch.testing.assert_close(data.grad, diff / deviation)
-    assert layer.blobs[2].item() == 2  # and adds nothing to the sums
 
 
 @pytest.mark.parametrize("phase", [TRAIN, TEST], ids=["TRAIN", "TEST"])

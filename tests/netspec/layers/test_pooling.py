@@ -114,48 +114,6 @@ def test_max_pooling_of_nan_and_infinity_agrees_with_plain_loops(build, value: f
         np.testing.assert_array_equal(bottom.grad, diff)
 
 
-def test_a_window_of_only_nan_is_minus_flt_max_without_gradient(build) -> None:
-    data = torch.full((1, 1, 2, 4), math.nan)
-    data[..., 2:] = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
-    bottom = data.requires_grad_()
-    top, mask = build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', (1, 1, 2, 4), tops=2).run(bottom)
-    assert top.flatten().tolist() == [LOWEST, 2]
-    assert mask.flatten().tolist() == [-1, 3]
-    top.sum().backward()
-    assert bottom.grad is not None
-    assert bottom.grad.flatten().tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
-
-
-def test_the_first_of_equal_maxima_gets_the_gradient(build) -> None:
-    bottom = torch.zeros(1, 1, 4, 4, requires_grad=True)
-    build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', bottom.shape).run(bottom)[0].sum().backward()
-    assert bottom.grad is not None
-    assert bottom.grad.nonzero()[:, 2:].tolist() == [[0, 0], [0, 2], [2, 0], [2, 2]]
-
-
-def test_window_count_rounds_up_and_drops_a_last_window_in_the_padding(build) -> None:
-    def tops(settings: str, height: int) -> int:
-        return build(f'type: "Pooling" pooling_param {{ {settings} }}', (1, 1, height, height)).top_shapes[0][2]
-
-    assert tops("kernel_size: 3 stride: 2", 6) == 3  # 1.5 + 1, rounded up
-    assert tops("kernel_size: 3 stride: 2 round_mode: FLOOR", 6) == 2
-    assert tops("kernel_size: 2 stride: 2 pad: 1", 5) == 3  # 2.5 + 1 rounded up is 4, but window 4 begins at the end
-    assert tops("kernel_size: 1 stride: 3", 5) == 3  # window 3 begins past the map: unpadded, it stays
-    assert tops("kernel_size: 3 stride: 2", 2) == 1  # a kernel longer than the map
-
-
-def test_an_empty_last_window_is_minus_flt_max_or_zero_over_its_remaining_area(build) -> None:
-    text = 'type: "Pooling" pooling_param { pool: %s kernel_h: 1 stride_h: %d kernel_w: 1 stride_w: 1 }'
-    top, mask = build(text % ("MAX", 3), (1, 1, 2, 1), tops=2).run(torch.ones(1, 1, 2, 1))
-    assert top.flatten().tolist() == [1, LOWEST]
-    assert mask.flatten().tolist() == [0, -1]
-    ends_there = build(text % ("AVE", 2), (1, 1, 2, 1)).run(torch.ones(1, 1, 2, 1))[0].flatten()
-    assert ends_there[0] == 1
-    assert ends_there[1].isnan()  # 0 / 0: the window begins where the map ends
-    begins_past_it = build(text % ("AVE", 3), (1, 1, 2, 1)).run(torch.ones(1, 1, 2, 1))[0].flatten()
-    assert begins_past_it.tolist() == [1, 0]  # 0 / -1
-
-
 @pytest.mark.parametrize("method", ["MAX", "AVE"])
 def test_global_pooling_covers_maps_of_any_size(build, method: str) -> None:
     layer = build(f'type: "Pooling" pooling_param {{ pool: {method} global_pooling: true }}', (2, 3, 5, 7))
@@ -177,11 +135,6 @@ def test_inference_kernel_pools_large_maps_of_both_memory_formats(build, kernel:
     run = inference_kernel(layer, Inference())
     assert run is not None
     assert torch.equal(run(data.contiguous(memory_format=memory_format)), layer.run(data)[0])
-
-
-def test_an_empty_batch_pools_to_an_empty_batch(build) -> None:
-    layer = build('type: "Pooling" pooling_param { kernel_size: 2 stride: 2 }', (2, 3, 4, 4))
-    assert layer.run(torch.empty(0, 3, 4, 4))[0].shape == (0, 3, 2, 2)
 
 
 def test_stochastic_pooling_draws_pixels_in_proportion_to_their_value(build) -> None:
