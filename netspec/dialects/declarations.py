@@ -64,7 +64,8 @@ def _add(blocks: list[Any], found: Any) -> None:
     elif found["value"]:
         inner.value.add(name=found["value"], number=int(found["of_value"], 0))
     else:
-        _fill(inner() if callable(inner) else inner.field.add(), found)
+        field: Any = inner() if callable(inner) else inner.field.add()
+        _fill(field, found)
 
 
 def _fill(field: FieldDescriptorProto, found: Any) -> None:

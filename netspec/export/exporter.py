@@ -62,12 +62,12 @@ def exporter_of(layer: Layer) -> Callable[..., Any]:
     A subclass with its own ``forward`` does not inherit how its base class is exported. Raises SpecError if the layer
     cannot be exported.
     """
-    cls = type(layer)
-    known = _exporters()
+    cls, known = type(layer), _exporters()
     owner = next((one for one in cls.__mro__ if path_of(one) in known or "to_torch" in vars(one)), None)
     if owner is None or getattr(owner, "forward", None) not in (cls.forward, Layer.forward):
         raise refusal(layer, getattr(layer, "not_exported", "its class does not say how"))
-    return partial(known[path_of(owner)], layer) if path_of(owner) in known else layer.to_torch
+    own: Any = layer
+    return partial(known[path_of(owner)], layer) if path_of(owner) in known else own.to_torch
 
 
 def refusal(layer: Layer, reason: str) -> SpecError:
@@ -78,7 +78,7 @@ def refusal(layer: Layer, reason: str) -> SpecError:
 def layer_notes(layers: Iterable[Layer]) -> list[str]:
     """Return what the user of an exported net must know of its layers, in lines."""
     lost = "starts at zero in every run; in Caffe it continues in the next run if cont is 1"
-    recurrent = [layer for layer in layers if getattr(layer, "state_names", ()) and not layer.exposed]
+    recurrent: list[Any] = [layer for layer in layers if getattr(layer, "state_names", ()) and not layer.exposed]
     return [str(layer.error(f"its state ({', '.join(layer.state_names)}) {lost}")) for layer in recurrent]
 
 

@@ -1,18 +1,19 @@
 """A command that is killed while it writes: each file is missing or complete, and the next run removes the rest."""
 
+import multiprocessing
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
 
-import netspec.files.whole_file
-from faults.commands import CASES, Case
+from faults.commands import CASES
 from netspec.data.database import open_reader
 from netspec.load import load_solver
 from netspec.solver.snapshot import read_state
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="has no SIGKILL")]
 
 
 @pytest.fixture(autouse=True)
@@ -21,15 +22,20 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("out").mkdir()
 
 
-def killed_at(case: Case, sync: int) -> bool:
-    """Run a command in a fork that is killed when a file is synced to disk for that time. Returns whether it was."""
-    child = os.fork()
-    if not child:
-        left = iter(range(1, sync))
-        os.fsync = lambda descriptor: next(left, 0) or os.kill(os.getpid(), signal.SIGKILL)
-        netspec.files.whole_file._swept.clear()  # in this process, but not in new ones
-        os._exit(case.main(list(case.words)))
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+def run(name: str, sync: int) -> None:
+    """Run a command that is killed when a file is synced to disk for that time."""
+    left = iter(range(1, sync))
+    os.fsync = lambda descriptor: next(left, 0) or os.kill(os.getpid(), signal.SIGKILL)
+    sys.exit(CASES[name].main(list(CASES[name].words)))
+
+
+def killed_at(name: str, sync: int) -> bool:
+    """Run a command in a process of its own. Returns whether it was killed."""
+    # A fork of pytest would inherit locks of its threads.
+    process = multiprocessing.get_context("forkserver").Process(target=run, args=(name, sync))
+    process.start()
+    process.join()
+    return process.exitcode == -signal.SIGKILL
 
 
 def leftovers() -> list[Path]:
@@ -37,10 +43,9 @@ def leftovers() -> list[Path]:
 
 
 def test_a_training_killed_during_a_snapshot_can_be_resumed() -> None:
-    case = CASES["train"]
-    case.prepare()
+    CASES["train"].prepare()
     for sync in range(1, 16, 2):  # the files of two snapshots and their folder
-        assert killed_at(case, sync)
+        assert killed_at("train", sync)
         states = sorted(Path("out").glob("*.solverstate"), key=lambda path: int(path.stem.rpartition("_")[2]))
         assert all(Path(read_state(state).learned_net).is_file() for state in states)
         if states:
@@ -48,16 +53,15 @@ def test_a_training_killed_during_a_snapshot_can_be_resumed() -> None:
             assert solver.iteration == int(states[-1].stem.rpartition("_")[2])
             solver.close()
     assert states
-    assert not killed_at(case, 1000)
+    assert not killed_at("train", 1000)
     assert not leftovers()
 
 
 def test_a_database_of_a_killed_command_is_missing() -> None:
-    case = CASES["convert"]
-    case.prepare()
-    assert killed_at(case, 1)
+    CASES["convert"].prepare()
+    assert killed_at("convert", 1)
     assert leftovers()
     assert not Path("out/db").exists()
-    assert not killed_at(case, 1000)
+    assert not killed_at("convert", 1000)
     assert len(open_reader("out/db")) == 80
     assert not leftovers()

@@ -178,9 +178,11 @@ def assert_same_gradients(net: Net, inputs: Arrays) -> None:
     outputs = (net(**given[0]), there if isinstance(there, dict) else dict(zip(net.outputs, [there], strict=True)))
     for found in outputs:
         rng = torch.Generator().manual_seed(3)
-        sums = [(x * torch.randn(x.shape, generator=rng)).sum() for x in (found[name] for name in net.outputs)]
-        if sums and sum(sums).requires_grad:
-            sum(sums).backward()
+        total = torch.zeros(())
+        for x in (found[name] for name in net.outputs):
+            total = total + (x * torch.randn(x.shape, generator=rng)).sum()
+        if total.requires_grad:
+            total.backward()
     expected = {f"of {name}": x.grad for name, x in given[0].items() if x.grad is not None}
     got = {f"of {name}": given[1][name].grad for name in inputs if f"of {name}" in expected}
     definition, _ = settled(net, lambda shapes: write_definition(net, shapes))
@@ -195,11 +197,11 @@ def assert_same_gradients(net: Net, inputs: Arrays) -> None:
                     total.as_strided(tensor.shape, tensor.stride()).add_(0 if found is None else found)
         got[f"of parameter {i}"] = total
     zero = {name: torch.zeros_like(x) for name, x in expected.items()}
-    arrays = [
+    there, here = (
         {name: (zero[name] if x is None else x).detach().numpy() for name, x in each.items()}
         for each in (got, expected)
-    ]
-    assert_same(*arrays)
+    )
+    assert_same(there, here)
 
 
 def is_of(refusal: Refused, kind: str) -> bool:

@@ -142,8 +142,8 @@ class _CtcLoss(Layer):
         if wrong := [label for label in labels if not 0 <= label < classes]:
             raise self.error(f"found label {wrong[0]}, expected 0 to {classes - 1}", "bottom")
         flat = torch.tensor(labels, dtype=torch.long, device=scores.device)
-        given = flat, list(steps), [len(text) for text in texts]
-        total = F.ctc_loss(F.log_softmax(scores, 2), *given, blank, "sum", zero_infinity=True)
+        sizes: Any = list(steps), [len(text) for text in texts]
+        total = F.ctc_loss(F.log_softmax(scores, 2), flat, sizes[0], sizes[1], blank, "sum", zero_infinity=True)
         return with_gradient_of(lambda: total, total / len(texts))
 
 

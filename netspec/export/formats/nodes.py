@@ -36,7 +36,9 @@ def _(boxes: torch.Tensor, overlap: float) -> torch.Tensor:
 
 def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
     """Return the functions that write the nodes, by the operator of torch, as ``torch.onnx.export`` takes them."""
-    from onnxscript import opset18 as op
+    import onnxscript
+
+    op: Any = onnxscript.opset18
 
     def sort(x: Any, stable: bool = False, dim: int = -1, descending: bool = False) -> Any:
         """TopK has the first of equal values first."""

@@ -130,7 +130,7 @@ class _Writer:
         with _signals_kept(), _quiet(), torch.no_grad():
             traced = torch.export.export(module, (tuple(examples),), dynamic_shapes=sizes, strict=False)
             options = {"opset_version": OPSET, "custom_translation_table": translations()}
-            program = torch.onnx.export(traced, dynamo=True, optimize=False, verbose=False, **options)
+            program: Any = torch.onnx.export(traced, dynamo=True, optimize=False, verbose=False, **options)
             self._set_ends(program.model.graph)
             _simplify(program.model)
         model = program.model

@@ -71,7 +71,7 @@ def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: Mappi
     with whole_file(path) as unfinished, unfinished.open("wb") as file:
         file.write(len(text).to_bytes(8, "little") + text)
         for _, tensor in sorted(state.items()):
-            file.write(values_of(tensor).cpu().float().reshape(-1).numpy())
+            file.write(values_of(tensor).cpu().float().reshape(-1).numpy().data)
 
 
 def torch_source(net: Net, origin: str = "a prototxt") -> tuple[str, dict[str, torch.Tensor], list[str]]:
