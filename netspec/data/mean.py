@@ -5,6 +5,7 @@ Caffe: src/caffe/data_transformer.cpp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from tokenize import TokenError
 
 import numpy as np
@@ -41,8 +42,22 @@ def read_mean(path: str, where: Where | None = None) -> np.ndarray:
     return mean.reshape(mean.shape[-3:]).astype(np.float32)
 
 
-def center(mean: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the center of a larger mean image (C, H, W), cropped as Caffe crops images in phase TEST."""
+def fitted(mean: np.ndarray, shape: Sequence[int | None], name: str, where: Where) -> np.ndarray:
+    """Return a mean that broadcasts against images of ``shape`` (C, H, W); ``name`` is the mean's in an error.
+
+    It is one number, one for each channel, or an image (C, H, W), whose center is taken, as Caffe crops images in phase
+    TEST. Raises SpecError for a mean that does not fit, as an image does not if the height or width is dynamic (None).
+    """
+    channels, height, width = shape
+    if mean.ndim < 2:
+        if mean.size not in (1, channels):
+            raise SpecError(f"{name} has {mean.size} values, expected 1 or {channels}, one for each channel", where)
+        return mean.reshape(-1, 1, 1)
+    mean = mean[0] if mean.ndim == 4 and len(mean) == 1 else mean
+    if height is None or width is None:
+        raise SpecError(f"{name} is an image, but the height and width are dynamic; give one for each channel", where)
+    if mean.ndim != 3 or mean.shape[0] != channels or mean.shape[1] < height or mean.shape[2] < width:
+        raise SpecError(f"{name} has shape {mean.shape}, expected at least {tuple(shape)} for these images", where)
     top, left = (mean.shape[1] - height) // 2, (mean.shape[2] - width) // 2
     return mean[:, top : top + height, left : left + width]
 

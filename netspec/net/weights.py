@@ -181,6 +181,7 @@ def too_large(size: int) -> str:
 
 def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
     """Write like :func:`save_weights`, but always in HDF5."""
+    check_names(net, path)
     shared = _shared(net)
     nested = [layer.param.name for layer in net.layers if "/" in layer.param.name and layer.blobs]
     if nested:
@@ -191,7 +192,7 @@ def write_hdf5(net: Net, path: str | Path, diff: bool = False) -> None:
     with new_hdf5(path) as file:
         data = file.create_group("data")
         diffs = file.create_group("diff") if diff else None
-        for layer in net.layers:
+        for layer in reversed(net.layers_by_name().values()):
             name = layer.param.name
             group = data.require_group(name)
             for j in range(len(layer.blobs)):
@@ -302,16 +303,20 @@ def _from_arrays(net: Net, layers: Iterable[tuple[str, Any]], path: str, report:
 # Net
 
 
+def check_names(net: Net, path: str | Path) -> None:
+    """Raise SpecError if two layers have one name, but not the same blobs: only the first would get its weights."""
+    named = net.layers_by_name()
+    for layer in net.layers:
+        if len(layer.blobs) and [*map(id, layer.blobs)] != [*map(id, named[layer.param.name].blobs)]:
+            fault = f'two layers have the name "{layer.param.name}"; rename one of them'
+            raise SpecError(f"cannot be written: {fault}", Where(str(path)))
+
+
 def _shared(net: Net) -> set[tuple[str, int]]:
     """Return the blobs, as (layer, index), that an earlier layer owns."""
-    owned: set[int] = set()
-    shared = set()
-    for layer in net.layers:
-        for j, blob in enumerate(layer.blobs):
-            if id(blob) in owned:
-                shared.add((layer.param.name, j))
-            owned.add(id(blob))
-    return shared
+    owners: dict[int, tuple[str, int]] = {}
+    places = [(blob, (layer.param.name, j)) for layer in net.layers for j, blob in enumerate(layer.blobs)]
+    return {place for blob, place in places if owners.setdefault(id(blob), place) != place}
 
 
 def _values(layer: Any, j: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from netspec.graph.filter import filter_net, with_state
 from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
-from netspec.net.weights import load_weights
+from netspec.net.weights import check_names, load_weights
 from netspec.proto.schema import PHASES
 from netspec.proto.text import parse_net
 
@@ -88,6 +88,7 @@ def export_net(source: Source, target: str, out: Path, preprocess: Preprocess | 
         return export_onnx(net, out, source.metadata(), preprocess)
     if target == "torch":
         return export_torch(net, out, source.origin)
+    check_names(net, out)
     write_tensors(blob_tensors(net), out, source.metadata())
     return []
 
@@ -109,6 +110,7 @@ def fold_files(source: Source, prefix: Path) -> tuple[int, int]:
     if not prefix.parent.is_dir():
         raise SpecError(f"there is no folder {prefix.parent}; create it first", Where(str(prefix)))
     net = source.net()
+    check_names(net, prefix)
     message = fold(net)
     write_caffe(message, prefix)
     splits = sum(layer.passes_on for layer in net.layers)

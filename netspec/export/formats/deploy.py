@@ -39,21 +39,22 @@ def with_inputs(net: Any, source: SourceMap, options: BuildOptions, labels: bool
     if faults := wrong_given_shapes(options.given_shapes, [filtered], source.file):
         raise faults[0]
     probe = build_net(filtered, source, replace(options, device="meta", seed=0, open_data=False))
-    built = {layer.param.name: layer for layer in probe.layers}
+    built = iter(probe.layers)  # with Splits between them; two layers may have one name
     result = copy_without(filtered, {"layer"})
     positions, missing = [], set()
     for i, layer in enumerate(filtered.layer):
+        made = next(each for each in built if each.param.name == layer.name)
         if missing & set(layer.bottom):
             missing.update(layer.top)
             continue
         missing.difference_update(layer.top)
-        if not isinstance(built[layer.name], DataLayer):
+        if not isinstance(made, DataLayer):
             result.layer.add().CopyFrom(layer)
             positions.append(source.layers[i])
             continue
         kept = list(layer.top) if labels else list(layer.top)[:1]
         missing.update(list(layer.top)[len(kept) :])
-        add_input(result, layer.name, dict(zip(kept, built[layer.name].top_shapes, strict=False)))
+        add_input(result, layer.name, dict(zip(kept, made.top_shapes, strict=False)))
         positions.append(source.layers[i])
     return result, source.with_layers(positions)
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netspec.data.mean import center
+from netspec.data.mean import fitted
 from netspec.data.preprocess import preprocessed
-from netspec.errors import SpecError
+from netspec.errors import SpecError, Where
 
 if TYPE_CHECKING:
     from netspec.export.formats.shapes import Sizes  # which imports torch
@@ -56,21 +56,7 @@ class Preprocess:
 
     def mean_for(self, shape: Sizes) -> np.ndarray | None:
         """Return the mean in a shape for subtraction from an input (N, C, H, W) of this shape."""
-        if self.mean is None:
-            return None
-        mean = np.asarray(self.mean, np.float32)
-        _, channels, height, width = shape
-        if mean.ndim == 1 and len(mean) in (1, channels):
-            return mean.reshape(-1, 1, 1)
-        if mean.ndim == 3 and mean.shape[0] == channels and height is not None and width is not None:
-            if mean.shape[1] < height or mean.shape[2] < width:
-                found = f"found a mean of {mean.shape[1]} x {mean.shape[2]} pixels"
-                raise SpecError(f"{found}, expected at least {height} x {width}")
-            return center(mean, height, width)
-        raise SpecError(
-            f"--mean: found a mean of shape {mean.shape}, expected one number for each of the {channels} channels, "
-            f"or an image of the size of {self.blob}, {shape[1:]}"
-        )
+        return None if self.mean is None else fitted(self.mean, shape[1:], "the mean", Where("--mean"))
 
     def check(self, shape: Sizes) -> None:
         """Raise SpecError if the steps do not fit an input of this shape."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from netspec.data.blobs import Shape
-from netspec.data.mean import center, read_mean, read_mean_option
+from netspec.data.mean import fitted, read_mean, read_mean_option
 from netspec.data.preprocess import preprocessed
 from netspec.errors import SpecError, Where
 from netspec.proto.schema import LayerParameter
@@ -52,22 +52,8 @@ class Steps:
         return Steps(None if values is None else np.asarray(values, np.float32), *factors, reverses, "from the options")
 
     def fitted(self, shape: Shape, name: str, where: Where) -> Steps:
-        """Return the steps with a mean that broadcasts against images of ``shape`` (C, H, W); ``name`` is the mean's.
-
-        A mean image larger than the images is cropped to its center, as in Caffe in phase TEST. Raises SpecError for a
-        mean that does not fit.
-        """
-        if self.mean is None:
-            return self
-        mean, (channels, height, width) = self.mean, shape
-        if mean.ndim < 2:
-            if mean.size not in (1, channels):
-                raise SpecError(f"{name} has {mean.size} values, expected 1 or {channels}, one for each channel", where)
-            return replace(self, mean=mean.reshape(-1, 1, 1))
-        mean = mean[0] if mean.ndim == 4 and len(mean) == 1 else mean
-        if mean.ndim != 3 or mean.shape[0] != channels or mean.shape[1] < height or mean.shape[2] < width:
-            raise SpecError(f"{name} has shape {mean.shape}, expected at least {shape} for these images", where)
-        return replace(self, mean=center(mean, height, width))
+        """Return the steps with a mean that broadcasts against images of ``shape`` (C, H, W): see data/mean.py."""
+        return self if self.mean is None else replace(self, mean=fitted(self.mean, shape, name, where))
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
         """Return the input of the net, float32, for images (..., C, H, W); the mean must fit: see :meth:`fitted`."""

@@ -143,7 +143,7 @@ class MemoryData(DataLayer):
 
     def set_input_arrays(self, data: np.ndarray, labels: np.ndarray) -> None:
         """Take images (n, C, H, W) and labels (n,), n a multiple of the batch size; they are not transformed."""
-        data, labels = np.asarray(data, np.float32), np.asarray(labels, np.float32).reshape(-1)
+        data, labels = (np.ascontiguousarray(array, np.float32) for array in (data, np.reshape(labels, -1)))
         batch, *image = self.shape
         if data.shape[1:] != tuple(image) or len(data) != len(labels) or not len(data) or len(data) % batch:
             expected = f"images (n, {', '.join(map(str, image))}) and n labels, n a multiple of batch_size {batch}"

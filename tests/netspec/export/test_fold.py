@@ -15,7 +15,7 @@ from netspec.graph.options import BuildOptions
 from netspec.net.build import build_net
 from netspec.net.net import Net
 from netspec.proto.schema import TEST
-from netspec.proto.text import parse_net
+from netspec.proto.text import parse_net, parse_net_text
 from paths import GOLDEN
 
 INPUT = 'layer { name: "data" type: "Input" top: "data" input_param { shape { dim: 2 dim: 4 dim: 5 dim: 5 } } }'
@@ -139,6 +139,15 @@ def test_a_training_net_becomes_a_deploy_net(monkeypatch: pytest.MonkeyPatch) ->
     assert net.inputs == ["pair_data"]
     assert not any(layer.is_loss for layer in net.layers)
     assert net.outputs
+
+
+def test_a_data_layer_with_the_name_of_another_layer_becomes_an_input() -> None:
+    text = """layer { name: "d" type: "MemoryData" top: "x" top: "t"
+      memory_data_param { batch_size: 1 channels: 1 height: 1 width: 2 } }
+    layer { name: "d" type: "InnerProduct" bottom: "x" top: "y" inner_product_param { num_output: 1 } }"""
+    message, source = parse_net_text(text, "net.prototxt")
+    deploy, _ = with_inputs(message, source, BuildOptions(), labels=False)
+    assert [layer.type for layer in deploy.layer] == ["Input", "InnerProduct"]
 
 
 CASES = [

@@ -254,8 +254,8 @@ def test_the_preprocessing_of_images_is_part_of_the_model(name: str, net_of: Cal
 @pytest.mark.parametrize(
     ("steps", "fault"),
     [
-        (Preprocess(mean=np.zeros(2)), "found a mean of shape (2,), expected one number for each of the 3 channels"),
-        (Preprocess(mean=np.zeros((3, 5, 20))), "found a mean of 5 x 20 pixels, expected at least 12 x 10"),
+        (Preprocess(mean=np.zeros(2)), "the mean has 2 values, expected 1 or 3, one for each channel"),
+        (Preprocess(mean=np.zeros((3, 5, 20))), "the mean has shape (3, 5, 20), expected at least (3, 12, 10)"),
     ],
     ids=["channels", "pixels"],
 )

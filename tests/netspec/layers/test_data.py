@@ -347,7 +347,7 @@ def test_memory_data_repeats_its_arrays(build: Callable[..., Layer]) -> None:
     assert layer.top_shapes == [(2, 1, 1, 3), (2, 1, 1, 1)]
     with pytest.raises(SpecError, match="has no data yet"):
         layer.run()
-    layer.set_input_arrays(np.arange(12).reshape(4, 1, 1, 3), np.array([5, 6, 7, 8]))
+    layer.set_input_arrays(np.arange(12).reshape(4, 1, 1, 3), np.array([8, 7, 6, 5])[::-1])
     labels = [layer.run()[1].ravel().tolist() for _ in range(3)]
     assert labels == [[5, 6], [7, 8], [5, 6]]
     layer.restart()

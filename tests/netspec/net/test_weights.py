@@ -93,6 +93,24 @@ def test_layer_names_with_a_slash_get_a_warning_in_hdf5_only(
     assert all("a/b" in text and "BINARYPROTO" in text for text in reported)
 
 
+SAME_NAME = """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 dim: 2 } } }
+layer { name: "ip" type: "InnerProduct" bottom: "x" top: "a" %s inner_product_param { num_output: 2 } }
+layer { name: "ip" type: "InnerProduct" bottom: "a" top: "b" %s inner_product_param { num_output: 2 } }
+"""
+
+
+def test_hdf5_has_layers_of_one_name_only_if_they_share_their_blobs(tmp_path: Path) -> None:
+    shared = 'param { name: "w" } param { name: "b" }'
+    net = net_of(SAME_NAME % (shared, shared))
+    fill(net)
+    save_weights(net, tmp_path / "w.h5", diff=True)
+    other = net_of(SAME_NAME % (shared, shared), seed=2)
+    load_weights(other, tmp_path / "w.h5")
+    np.testing.assert_array_equal(other.params["ip"][0].detach(), net.params["ip"][0].detach())
+    with pytest.raises(SpecError, match='two layers have the name "ip"; rename one of them'):
+        save_weights(net_of(SAME_NAME % ("", "")), tmp_path / "w.h5")
+
+
 def test_hdf5_weights_have_the_structure_of_caffes(golden_net, tmp_path: Path):
     theirs = GOLDEN / "snapshot/h5_iter_10.caffemodel.h5"
     net = golden_net("snapshot")
