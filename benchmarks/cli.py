@@ -42,36 +42,12 @@ def parser() -> Parser:
     _add_growth(commands)
     _add_revisits(commands)
     _add_tables(commands)
-    _add_pages(commands)
-    _add_list(commands)
+    commands.add_parser("pages", _pages, help="write the results in benchmarks/results into the documentation")
+    commands.add_parser("list", _list, help="list the nets of the catalog")
     return made
 
 
 def _add_common(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
-    _add_programs(parser, known, default)
-    parser.add_argument("--caffe", metavar="BINARY", help="also time this caffe binary")
-    parser.add_argument("--batch", type=int, nargs="+", default=[1], help="one or several batch sizes (default: 1)")
-    parser.add_argument(
-        "--threads", type=int, nargs="+", default=[1], help="one or several numbers of threads (default: 1)"
-    )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        default=60,
-        help="time limit for one net, batch size and number of threads; at least 3 rounds are run (default: 60)",
-    )
-
-
-def _add_nets(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
-
-
-def _add_nets_or_prototxts(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
-    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-
-
-def _add_programs(parser: argparse.ArgumentParser, known: Sequence[str], default: Sequence[str]) -> None:
     parser.add_argument(
         "--with",
         dest="programs",
@@ -84,6 +60,17 @@ def _add_programs(parser: argparse.ArgumentParser, known: Sequence[str], default
         "--rounds", type=int, default=9, help="number of rounds; every program runs once per round (default: 9)"
     )
     _add_json(parser)
+    parser.add_argument("--caffe", metavar="BINARY", help="also time this caffe binary")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1], help="one or several batch sizes (default: 1)")
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1], help="one or several numbers of threads (default: 1)"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=60,
+        help="time limit for one net, batch size and number of threads; at least 3 rounds are run (default: 60)",
+    )
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
@@ -106,8 +93,9 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_revisits(commands: Commands) -> None:
-    parser = commands.add_parser("revisits", help="measure what loopclosure finds on real drives that come back")
-    parser.set_defaults(function=_revisits)
+    parser = commands.add_parser(
+        "revisits", _revisits, help="measure what loopclosure finds on real drives that come back"
+    )
     _add_data(parser)
     parser.add_argument("drives", nargs="*", metavar="DRIVE", help="how the names of the drives begin (default: all)")
 
@@ -119,8 +107,9 @@ def _revisits(arguments: argparse.Namespace) -> None:
 
 
 def _add_tables(commands: Commands) -> None:
-    parser = commands.add_parser("tables", help="measure loopclosure's methods for the tables in the documentation")
-    parser.set_defaults(function=_tables)
+    parser = commands.add_parser(
+        "tables", _tables, help="measure loopclosure's methods for the tables in the documentation"
+    )
     _add_data(parser)
     parser.add_argument("sets", nargs="*", metavar="SET", help="data sets to measure (default: all)")
     parser.add_argument(
@@ -139,20 +128,10 @@ def _tables(arguments: argparse.Namespace) -> None:
     measure(arguments.data, arguments.work, arguments.sets, arguments.methods, say, arguments.words)
 
 
-def _add_pages(commands: Commands) -> None:
-    parser = commands.add_parser("pages", help="write the results in benchmarks/results into the documentation")
-    parser.set_defaults(function=_pages)
-
-
 def _pages(arguments: argparse.Namespace) -> None:
     from benchmarks import pages
 
     print("\n".join(f"written: {page.relative_to(pages.ROOT)}" for page in pages.write()) or "no number changed")
-
-
-def _add_list(commands: Commands) -> None:
-    parser = commands.add_parser("list", help="list the nets of the catalog")
-    parser.set_defaults(function=_list)
 
 
 def _list(arguments: argparse.Namespace) -> None:
@@ -162,9 +141,9 @@ def _list(arguments: argparse.Namespace) -> None:
 
 
 def _add_forward(commands: Commands) -> None:
-    parser = commands.add_parser("forward", help="compare the time of forward passes with other programs")
-    parser.set_defaults(function=_forward)
-    _add_nets_or_prototxts(parser)
+    parser = commands.add_parser("forward", _forward, help="compare the time of forward passes with other programs")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
+    parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
     _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
 
 
@@ -179,9 +158,8 @@ def _forward(arguments: argparse.Namespace) -> None:
 
 
 def _add_train(commands: Commands) -> None:
-    parser = commands.add_parser("train", help="time training iterations: forward, backward, update")
-    parser.set_defaults(function=_train)
-    _add_nets(parser)
+    parser = commands.add_parser("train", _train, help="time training iterations: forward, backward, update")
+    parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list)")
     _add_common(parser, TRAINING, ("netspec", "pytorch"))
     parser.add_argument("--device", default="cpu", help="torch device for netspec and pytorch (default: cpu)")
 
@@ -195,8 +173,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _add_growth(commands: Commands) -> None:
-    parser = commands.add_parser("growth", help="measure how time and memory grow with layers or frames")
-    parser.set_defaults(function=_growth)
+    parser = commands.add_parser("growth", _growth, help="measure how time and memory grow with layers or frames")
     parser.add_argument("kind", choices=KINDS, help="what to increase")
     parser.add_argument(
         "sizes", type=int, nargs="*", metavar="SIZE", help="sizes to measure (default: depends on the kind)"
@@ -223,8 +200,8 @@ def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = N
 
 
 def _add_whole(commands: Commands) -> None:
-    parser = commands.add_parser("programs", help="time whole programs: detectors, files, a training, a start")
-    parser.set_defaults(function=_whole, programs=["opencv4"])
+    parser = commands.add_parser("programs", _whole, help="time whole programs: detectors, files, a training, a start")
+    parser.set_defaults(programs=["opencv4"])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"programs to time: {', '.join(WHOLE)} (default: all)")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads (default: 1 2)")
     parser.add_argument("--rounds", type=int, default=3, help="number of rounds (default: 3)")

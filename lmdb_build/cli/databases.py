@@ -37,8 +37,24 @@ from netspec.terminal.parser import Commands
 
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
-    _add_convert_pairs(commands)
-    _add_convert_images(commands)
+    _add_image_list(
+        commands.add_parser(
+            "convert",
+            _convert_pairs,
+            help="write the pairs of a list into a database (convert_pairs_lmdb)",
+            epilog=OF_PAIRS,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+    )
+    _add_image_list(
+        commands.add_parser(
+            "imageset",
+            _convert_images,
+            help="write the images of a list into a database (convert_imageset)",
+            epilog=OF_IMAGES,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+    )
     _add_mean(commands)
     _add_mnist(commands)
     _add_cifar(commands)
@@ -100,32 +116,10 @@ OF_IMAGES = """Write one Datum per image into a database that Caffe reads.
 A line of LISTFILE is, for example, "subfolder/file.png 7". Unreadable images are skipped; the last line counts them."""
 
 
-def _add_convert_pairs(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "convert",
-        help="write the pairs of a list into a database (convert_pairs_lmdb)",
-        epilog=OF_PAIRS,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(function=_convert_pairs)
-    _add_image_list(parser)
-
-
 def _convert_pairs(arguments: argparse.Namespace) -> None:
     name = arguments.db_name.rstrip("/")
     twins = [f"{name}_a", f"{name}_b"] if _is_encoded(arguments) else [name]
     _convert(arguments, read_pairs, twins, pair_key, "pairs")
-
-
-def _add_convert_images(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "imageset",
-        help="write the images of a list into a database (convert_imageset)",
-        epilog=OF_IMAGES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(function=_convert_images)
-    _add_image_list(parser)
 
 
 def _convert_images(arguments: argparse.Namespace) -> None:
@@ -170,8 +164,7 @@ def _is_encoded(arguments: argparse.Namespace) -> bool:
 
 
 def _add_mean(commands: Commands) -> None:
-    parser = commands.add_parser("mean", help="compute the mean image of a database (compute_image_mean)")
-    parser.set_defaults(function=_mean)
+    parser = commands.add_parser("mean", _mean, help="compute the mean image of a database (compute_image_mean)")
     _add_backend(parser)
     parser.add_argument("input_db", metavar="INPUT_DB", help="the database to read")
     parser.add_output("output_file", nargs="?", metavar="OUTPUT_FILE", help="where to write the mean, as .binaryproto")
@@ -185,8 +178,7 @@ def _mean(arguments: argparse.Namespace) -> None:
 
 
 def _add_mnist(commands: Commands) -> None:
-    parser = commands.add_parser("mnist", help="write the MNIST files into a database (convert_mnist_data)")
-    parser.set_defaults(function=_mnist)
+    parser = commands.add_parser("mnist", _mnist, help="write the MNIST files into a database (convert_mnist_data)")
     _add_backend(parser)
     parser.add_argument("--pairs", action="store_true", help="write randomly chosen pairs (convert_mnist_siamese_data)")
     parser.add_argument("images", metavar="IMAGES", help="uncompressed file of images, such as train-images-idx3-ubyte")
@@ -200,8 +192,9 @@ def _mnist(arguments: argparse.Namespace) -> None:
 
 
 def _add_cifar(commands: Commands) -> None:
-    parser = commands.add_parser("cifar", help="write the CIFAR-10 files into two databases (convert_cifar_data)")
-    parser.set_defaults(function=_cifar)
+    parser = commands.add_parser(
+        "cifar", _cifar, help="write the CIFAR-10 files into two databases (convert_cifar_data)"
+    )
     parser.add_argument(
         "input_folder",
         metavar="INPUT_FOLDER",
@@ -221,9 +214,8 @@ def _cifar(arguments: argparse.Namespace) -> None:
 
 def _add_compare(commands: Commands) -> None:
     parser = commands.add_parser(
-        "compare", help="train Siamese nets on the same pairs and print a table of their results"
+        "compare", _compare, help="train Siamese nets on the same pairs and print a table of their results"
     )
-    parser.set_defaults(function=_compare)
     parser.add_argument("solver", nargs="+", metavar="SOLVER", help="solver prototxt of a Siamese net")
     parser.add_argument(
         "--train",

@@ -11,11 +11,6 @@ from netspec.terminal.output import bar
 from netspec.terminal.parser import Commands, seed
 
 
-def add_commands(commands: Commands) -> None:
-    """Add ``walk``."""
-    _add_walk(commands)
-
-
 def _size(text: str) -> tuple[int, int]:
     """Read ``WIDTHxHEIGHT``."""
     width, cross, height = text.partition("x")
@@ -24,9 +19,9 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _add_walk(commands: Commands) -> None:
-    parser = commands.add_parser("walk", help="render walks through textured rooms, as TUM RGB-D sequences")
-    parser.set_defaults(function=_walk)
+def add_commands(commands: Commands) -> None:
+    """Add ``walk``."""
+    parser = commands.add_parser("walk", _walk, help="render walks through textured rooms, as TUM RGB-D sequences")
     parser.add_output("out", folder=True, type=Path, metavar="OUT", help="folder for the sequences walk_1, walk_2, ...")
     parser.add_argument(
         "--sequences",

@@ -69,11 +69,11 @@ def add_commands(commands: Commands) -> None:
 def _add_pairs(commands: Commands) -> None:
     parser = commands.add_parser(
         "pairs",
+        _pairs,
         help="choose labeled pairs and write their lists",
         epilog=HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(function=_pairs)
     parser.add_argument(
         "source",
         nargs="+",
@@ -305,8 +305,7 @@ def _shares(text: str) -> tuple[float, ...]:
 
 
 def _add_sheet(commands: Commands) -> None:
-    parser = commands.add_parser("sheet", help="draw sample pairs of a list")
-    parser.set_defaults(function=_sheet)
+    parser = commands.add_parser("sheet", _sheet, help="draw sample pairs of a list")
     parser.add_argument("list", type=Path, metavar="LIST", help="a list of pairs")
     parser.add_argument("picture", type=Path, metavar="PICTURE", help="the image to write, such as sheet.png")
     parser.add_argument(

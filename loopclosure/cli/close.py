@@ -15,8 +15,7 @@ from netspec.terminal.parser import Commands, seed
 
 def add_commands(commands: Commands) -> None:
     """Add ``close``."""
-    parser = commands.add_parser("close", help="correct a path using the loops that detect found")
-    parser.set_defaults(function=_close)
+    parser = commands.add_parser("close", _close, help="correct a path using the loops that detect found")
     parser.add_argument(
         "source",
         metavar="SOURCE",

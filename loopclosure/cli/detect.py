@@ -19,8 +19,7 @@ NOTHING = "next: look at the most similar pairs in the report; --least-precision
 
 def add_commands(commands: Commands) -> None:
     """Add ``detect``."""
-    parser = commands.add_parser("detect", help="find the loops in a folder of images, a video or a bag")
-    parser.set_defaults(function=_detect)
+    parser = commands.add_parser("detect", _detect, help="find the loops in a folder of images, a video or a bag")
     parser.add_argument(
         "source",
         metavar="SOURCE",

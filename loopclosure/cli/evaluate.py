@@ -15,11 +15,11 @@ def add_commands(commands: Commands) -> None:
     """Add ``evaluate``."""
     parser = commands.add_parser(
         "evaluate",
+        _evaluate,
         help="run methods on one data set and write a report",
         epilog=HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(function=_evaluate)
     add_data_set(parser)
     parser.add_argument(
         "--method",

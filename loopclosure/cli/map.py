@@ -31,7 +31,7 @@ def add_commands(commands: Commands) -> None:
     """Add ``map`` and its commands."""
     known_map = commands.add_group("map", help="keep a map of several drives on disk: build it, add to it, query it")
     _add_build(known_map)
-    _add_add(known_map)
+    _add_drives(known_map.add_parser("add", _add, help="add drives to a map and find the loops between all its drives"))
     _add_query(known_map)
     _add_close(known_map)
 
@@ -61,8 +61,7 @@ def _add_drives(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_build(commands: Commands) -> None:
-    parser = commands.add_parser("build", help="build a map of one or several drives")
-    parser.set_defaults(function=_build)
+    parser = commands.add_parser("build", _build, help="build a map of one or several drives")
     _add_drives(parser)
     parser.add_argument(
         "--describe", default="default", metavar="NAME", help="the net, default or small (default: %(default)s)"
@@ -73,12 +72,6 @@ def _build(a: argparse.Namespace) -> None:
     load_describe(checked_name(a.describe))
     recordings = _recordings(a, 0)  # before the map is made, in case a name is mistyped
     _add_all(Map.create(a.map, a.describe), recordings, a.index)
-
-
-def _add_add(commands: Commands) -> None:
-    parser = commands.add_parser("add", help="add drives to a map and find the loops between all its drives")
-    parser.set_defaults(function=_add)
-    _add_drives(parser)
 
 
 def _add(a: argparse.Namespace) -> None:
@@ -113,8 +106,7 @@ def _decided(detector: LoopDetector, own: bool = True) -> list[LoopResult]:
 
 
 def _add_query(commands: Commands) -> None:
-    parser = commands.add_parser("query", help="find the frames of a drive in a map, without adding them")
-    parser.set_defaults(function=_query)
+    parser = commands.add_parser("query", _query, help="find the frames of a drive in a map, without adding them")
     _add_map(parser)
     parser.add_argument("source", metavar="SOURCE", help="frames, as for detect")
     _add_index(parser)
@@ -159,8 +151,9 @@ def _located(known: Map, recording: ImageSequence, loops: Sequence[LoopResult]) 
 
 
 def _add_close(commands: Commands) -> None:
-    parser = commands.add_parser("close", help="join the sessions of a map by their loops, and correct their paths")
-    parser.set_defaults(function=_close)
+    parser = commands.add_parser(
+        "close", _close, help="join the sessions of a map by their loops, and correct their paths"
+    )
     _add_map(parser)
     parser.add_output("--out", folder=True, required=True, metavar="FOLDER", help="folder for the paths and closed.g2o")
 

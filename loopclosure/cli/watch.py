@@ -26,8 +26,7 @@ OF = DetectorSettings()
 
 def add_commands(commands: Commands) -> None:
     """Add ``watch``."""
-    parser = commands.add_parser("watch", help="find loops while images arrive from a camera or a stream")
-    parser.set_defaults(function=_watch)
+    parser = commands.add_parser("watch", _watch, help="find loops while images arrive from a camera or a stream")
     parser.add_argument(
         "--video", required=True, metavar="CAMERA|URL|FILE", help="camera 0, rtsp://HOST/PATH, a video file or a bag"
     )

@@ -6,16 +6,17 @@ import sys
 from collections.abc import Sequence
 
 from netspec.cli import caffe, caffe_tools, data, export, nets, run_script
+from netspec.cli.arguments import use_dialects
 from netspec.terminal.commands import run
-from netspec.terminal.parser import Commands, Parser, program
+from netspec.terminal.parser import CAFFES_LOG, NO_LOG, QUIET, Commands, Parser, program
 
-# The headings in ``netspec --help``, and the modules with the commands below each.
+# The headings in ``netspec --help``, and the log of the commands below each, and the modules with them.
 _GROUPS = {
-    "Caffe's programs": [caffe, caffe_tools],
-    "inspect nets": [nets],
-    "inspect data and trainings": [data],
-    "features and other formats": [export],
-    "programs written for pycaffe": [run_script],
+    "Caffe's programs": (CAFFES_LOG, caffe, caffe_tools),
+    "inspect nets": (QUIET, nets),
+    "inspect data and trainings": (QUIET, data),
+    "features and other formats": (QUIET, export),
+    "programs written for pycaffe": (NO_LOG, run_script),
 }
 
 
@@ -33,8 +34,8 @@ def parser() -> Parser:
     """Return the parser of all commands."""
     made = program("netspec", "Run Caffe's prototxt in PyTorch, with Caffe's numbers.")
     commands = Commands(made)
-    for heading, modules in _GROUPS.items():
-        commands.heading = heading
+    for heading, (log, *modules) in _GROUPS.items():
+        commands.heading, commands.defaults = heading, {**log, "prepare": use_dialects}
         for module in modules:
             module.add_commands(commands)
     return made

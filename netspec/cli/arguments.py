@@ -64,38 +64,6 @@ def _amount(text: str) -> int:
 # Options of several commands
 
 
-def add_plugin(parser: argparse.ArgumentParser) -> None:
-    """Add ``--plugin``, for commands that read nets."""
-    parser.add_argument(
-        "--plugin",
-        action="append",
-        default=[],
-        metavar="NAME|FILE.py",
-        help="a dialect (the layers of a fork of Caffe), by name or as a Python file; may be repeated",
-    )
-    parser.set_defaults(prepare=_use_dialects)
-
-
-def _use_dialects(arguments: argparse.Namespace) -> None:
-    for plugin in arguments.plugin:
-        use_dialect(plugin)
-
-
-def add_limit(parser: argparse.ArgumentParser) -> None:
-    """Add ``--limit``, for commands that build nets."""
-    parser.add_argument(
-        "--limit",
-        type=_amount,
-        metavar="SIZE",
-        help="refuse a net that needs more memory than this, e.g. 64GiB (default: the machine's memory)",
-    )
-
-
-def add_verbose(parser: argparse.ArgumentParser) -> None:
-    """Add ``-v``, for commands that build nets and otherwise show only warnings."""
-    parser.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
-
-
 class _Verbose(argparse.Action):
     """Show the whole log, as Caffe's own commands do."""
 
@@ -104,126 +72,103 @@ class _Verbose(argparse.Action):
             setattr(namespace, name, value)
 
 
-def add_net(parser: argparse.ArgumentParser) -> None:
-    """Add the net's prototxt, as an argument and as ``--model``; :func:`model` reads them."""
-    parser.add_argument("net", nargs="?", metavar="NET", help="the net's prototxt")
-    parser.add_argument("--model", metavar="MODEL", help="the net's prototxt, as an option like Caffe's")
+SHARED: dict[str, dict[str, dict[str, Any]]] = {  # by group: the settings of each option, for argparse
+    "plugin": {
+        "--plugin": {
+            "action": "append",
+            "default": [],
+            "metavar": "NAME|FILE.py",
+            "help": "a dialect (the layers of a fork of Caffe), by name or as a Python file; may be repeated",
+        }
+    },
+    "limit": {
+        "--limit": {
+            "type": _amount,
+            "metavar": "SIZE",
+            "help": "refuse a net that needs more memory than this, e.g. 64GiB (default: the machine's memory)",
+        }
+    },
+    "verbose": {"-v --verbose": {"nargs": 0, "action": _Verbose, "help": "show Caffe's log"}},
+    "net": {  # model() reads them
+        "net": {"nargs": "?", "metavar": "NET", "help": "the net's prototxt"},
+        "--model": {"metavar": "MODEL", "help": "the net's prototxt, as an option like Caffe's"},
+    },
+    "gpu": {"--gpu": {"default": "", "metavar": "GPU", "help": "number of the GPU to use (default: the CPU)"}},
+    "phase": {
+        "--phase": {
+            "type": str.upper,
+            "default": "TEST",
+            "choices": ["TEST", "TRAIN"],
+            "help": "phase of the net (default: %(default)s)",
+        }
+    },
+    "state": {
+        "--level": {
+            "type": _int32,
+            "default": 0,
+            "metavar": "LEVEL",
+            "help": "level of the NetState (default: %(default)s)",
+        },
+        "--stage": {"default": "", "metavar": "STAGE", "help": "stages of the NetState, separated by commas"},
+    },
+    "blob": {"--blob": {"action": "extend", "nargs": "+", "default": [], "metavar": "BLOB"}},
+    "shape": {"--shape": {"action": "append", "type": blob_shape, "default": [], "metavar": "BLOB=N,C,H,W"}},
+    "data": {"--data": {"action": "store_true", "help": "open databases, lists and mean files"}},
+    "strict": {"--strict": {"action": "store_true", "help": "refuse weights that lack a layer of the net"}},
+    "python": {
+        "--allow-python-layers": {"action": "store_true", "help": "allow the net's Python layers to run their code"}
+    },
+    "iterations": {
+        "--iterations": {
+            "type": positive,
+            "default": 50,
+            "metavar": "N",
+            "help": "batches to run (default: %(default)s)",
+        }
+    },
+    "exact": {
+        "--exact": {
+            "default": BuildOptions.exact,
+            "choices": EXACT,
+            "help": "which sums are bit-identical to Caffe's on the CPU; all is slower (default: %(default)s)",
+        }
+    },
+    "passes": {
+        "--passes": {
+            "type": _passes,
+            "default": PASSES,
+            "metavar": "NAMES",
+            "help": f"optimizations for a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
+        }
+    },
+    "engine": {  # run_by() reads them
+        "--engine": {
+            "default": TORCH,
+            "choices": [*ENGINES, f"{OPENVINO},{BF16}"],
+            "metavar": "NAME",
+            "help": f"engine that runs the net: {', '.join(ENGINES)} or {OPENVINO},{BF16}, which computes in bfloat16 "
+            "(default: %(default)s)",
+        },
+        "--precision": {"choices": PRECISIONS, "help": argparse.SUPPRESS},
+        "--cache": {
+            "metavar": "DIR|none",
+            "help": "folder to keep exported nets in, or none (default: the user's cache folder)",
+        },
+    },
+}
 
 
-def add_gpu(parser: argparse.ArgumentParser, text: str = "number of the GPU to use (default: the CPU)") -> None:
-    """Add ``--gpu``."""
-    parser.add_argument("--gpu", default="", metavar="GPU", help=text)
+def add(parser: argparse.ArgumentParser, *groups: str, **changed: Any) -> None:
+    """Add groups of :data:`SHARED`; ``changed`` are other settings of their options."""
+    for group in groups:
+        for names, settings in SHARED[group].items():
+            parser.add_argument(*names.split(), **{**settings, **changed})
 
 
-def add_phase(parser: argparse.ArgumentParser, default: str = "TEST") -> None:
-    """Add ``--phase``."""
-    parser.add_argument(
-        "--phase",
-        type=str.upper,
-        default=default,
-        choices=["TEST", "TRAIN"],
-        help="phase of the net (default: %(default)s)",
-    )
-
-
-def add_state(parser: argparse.ArgumentParser) -> None:
-    """Add ``--level`` and ``--stage``."""
-    parser.add_argument(
-        "--level", type=_int32, default=0, metavar="LEVEL", help="level of the NetState (default: %(default)s)"
-    )
-    parser.add_argument("--stage", default="", metavar="STAGE", help="stages of the NetState, separated by commas")
-
-
-def add_part(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose the part of a net to write: ``--blob``, ``--shape``, the state, Python layers."""
-    parser.add_argument(
-        "--blob",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="BLOB",
-        help="only the layers that compute these blobs",
-    )
-    add_shapes(parser, "the shape of an input or a data layer's top")
-    add_phase(parser)
-    add_state(parser)
-    add_python(parser)
-
-
-def add_shapes(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add ``--shape``, which may be repeated."""
-    parser.add_argument("--shape", action="append", type=blob_shape, default=[], metavar="BLOB=N,C,H,W", help=text)
-
-
-def add_strict(parser: argparse.ArgumentParser) -> None:
-    """Add ``--strict``."""
-    parser.add_argument("--strict", action="store_true", help="refuse weights that lack a layer of the net")
-
-
-def add_python(parser: argparse.ArgumentParser) -> None:
-    """Add ``--allow-python-layers``."""
-    parser.add_argument(
-        "--allow-python-layers", action="store_true", help="allow the net's Python layers to run their code"
-    )
-
-
-def add_exact(parser: argparse.ArgumentParser) -> None:
-    """Add ``--exact``."""
-    parser.add_argument(
-        "--exact",
-        default=BuildOptions.exact,
-        choices=EXACT,
-        help="which sums are bit-identical to Caffe's on the CPU; all is slower (default: %(default)s)",
-    )
-
-
-def add_passes(parser: argparse.ArgumentParser) -> None:
-    """Add ``--passes``."""
-    parser.add_argument(
-        "--passes",
-        type=_passes,
-        default=PASSES,
-        metavar="NAMES",
-        help=f"optimizations for a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
-    )
-
-
-def add_engine(parser: argparse.ArgumentParser) -> None:
-    """Add ``--engine`` and its options; :func:`run_by` reads them."""
-    parser.add_argument(
-        "--engine",
-        default=TORCH,
-        choices=[*ENGINES, f"{OPENVINO},{BF16}"],
-        metavar="NAME",
-        help=f"engine that runs the net: {', '.join(ENGINES)} or {OPENVINO},{BF16}, which computes in bfloat16 "
-        "(default: %(default)s)",
-    )
-    parser.add_argument("--precision", choices=PRECISIONS, help=argparse.SUPPRESS)
-    parser.add_argument(
-        "--cache",
-        metavar="DIR|none",
-        help="folder to keep exported nets in, or none (default: the user's cache folder)",
-    )
-
-
-def add_steps(parser: argparse.ArgumentParser) -> None:
-    """Add the options for preprocessing image files."""
-    parser.add_argument("--swap", action="store_true", help="for image files: reverse the channels, from BGR to RGB")
-    parser.add_argument(
-        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply the pixels (0 to 255) by this"
-    )
-    parser.add_argument(
-        "--mean",
-        metavar="A,B,C|FILE",
-        help="then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
-    )
-    parser.add_argument(
-        "--scale",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="then multiply by this; with any of these four options, the data layer's transform_param is not used",
-    )
+def use_dialects(arguments: argparse.Namespace) -> None:
+    """Use the dialects of ``--plugin``, for commands that have it."""
+    for plugin in getattr(arguments, "plugin", ()):
+        use_dialect(plugin)
 
 
 # Values of the options

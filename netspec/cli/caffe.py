@@ -13,25 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec import log
-from netspec.cli.arguments import (
-    add_engine,
-    add_exact,
-    add_gpu,
-    add_limit,
-    add_net,
-    add_passes,
-    add_phase,
-    add_plugin,
-    add_python,
-    add_state,
-    add_strict,
-    devices,
-    load,
-    options,
-    positive,
-    run_by,
-    stages,
-)
+from netspec.cli.arguments import add, devices, load, options, run_by, stages
 from netspec.cli.scores import Score, Scores
 from netspec.errors import SpecError
 from netspec.proto.binary import check_readable, split_paths
@@ -54,10 +36,8 @@ BAR = "{n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left{postfix}"
 
 
 def _add_train(commands: Commands) -> None:
-    parser = commands.add_parser("train", help="train or fine-tune a model (caffe train)")
-    parser.set_defaults(function=_train)
-    add_plugin(parser)
-    add_limit(parser)
+    parser = commands.add_parser("train", _train, help="train or fine-tune a model (caffe train)")
+    add(parser, "plugin", "limit")
     parser.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
     parser.add_argument("--solver", metavar="SOLVER", help="the solver's prototxt")
     parser.add_argument("--snapshot", metavar="SNAPSHOT", help="a .solverstate to resume from")
@@ -79,8 +59,10 @@ def _add_train(commands: Commands) -> None:
         choices=["stop", "warn"],
         help="what to do when the loss is NaN or infinite (default: %(default)s)",
     )
-    add_gpu(parser, "number of the GPU, several separated by commas, or all (default: the device in the solver)")
-    add_state(parser)
+    add(
+        parser, "gpu", help="number of the GPU, several separated by commas, or all (default: the device in the solver)"
+    )
+    add(parser, "state")
     parser.add_argument(
         "--sigint_effect",
         default="stop",
@@ -93,8 +75,7 @@ def _add_train(commands: Commands) -> None:
         choices=["stop", "snapshot", "none"],
         help="what SIGHUP does (default: %(default)s)",
     )
-    add_python(parser)
-    add_exact(parser)
+    add(parser, "python", "exact")
     parser.add_argument(
         "--precision",
         default="fp32",
@@ -102,7 +83,7 @@ def _add_train(commands: Commands) -> None:
         help="precision of forward and backward passes; bf16 is faster on CPUs and GPUs that support it, fp16 on "
         "GPUs; both are less accurate (default: %(default)s)",
     )
-    add_strict(parser)
+    add(parser, "strict")
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -259,23 +240,12 @@ def _signals(effects: Mapping[signal.Signals, str]) -> Iterator[_Signals]:
 
 
 def _add_test(commands: Commands) -> None:
-    parser = commands.add_parser("test", help="score a model on its TEST-phase data (caffe test)")
-    parser.set_defaults(function=_test)
-    add_plugin(parser)
-    add_limit(parser)
-    add_net(parser)
+    parser = commands.add_parser("test", _test, help="score a model on its TEST-phase data (caffe test)")
+    add(parser, "plugin", "limit", "net")
     parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
-    parser.add_argument(
-        "--iterations", type=positive, default=50, metavar="N", help="batches to run (default: %(default)s)"
-    )
+    add(parser, "iterations")
     parser.add_output("--scores", metavar="F.json", help="also write the mean scores to this file")
-    add_gpu(parser)
-    add_state(parser)
-    add_python(parser)
-    add_exact(parser)
-    add_passes(parser)
-    add_strict(parser)
-    add_engine(parser)
+    add(parser, "gpu", "state", "python", "exact", "passes", "strict", "engine")
 
 
 def _test(arguments: argparse.Namespace) -> None:
@@ -293,20 +263,10 @@ def _test(arguments: argparse.Namespace) -> None:
 
 
 def _add_time(commands: Commands) -> None:
-    parser = commands.add_parser("time", help="measure the forward and backward time of each layer (caffe time)")
-    parser.set_defaults(function=_time)
-    add_plugin(parser)
-    add_limit(parser)
-    add_net(parser)
-    parser.add_argument(
-        "--iterations", type=positive, default=50, metavar="N", help="passes to time (default: %(default)s)"
-    )
-    add_gpu(parser)
-    add_phase(parser, default="TRAIN")
-    add_state(parser)
-    add_python(parser)
-    add_exact(parser)
-    add_engine(parser)
+    parser = commands.add_parser("time", _time, help="measure the forward and backward time of each layer (caffe time)")
+    add(parser, "plugin", "limit", "net", "iterations", "gpu")
+    add(parser, "phase", default="TRAIN")
+    add(parser, "state", "python", "exact", "engine")
 
 
 def _time(arguments: argparse.Namespace) -> None:

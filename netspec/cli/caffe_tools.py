@@ -7,26 +7,33 @@ import logging
 from pathlib import Path
 
 from netspec import log
-from netspec.cli.arguments import add_limit, add_plugin, device, options, positive
+from netspec.cli.arguments import add, device, options, positive
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import TEST
-from netspec.terminal.parser import Commands, Parser
+from netspec.terminal.parser import Commands
 
 
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
     _add_extract_features(commands)
-    _add_device_query(commands)
-    _add_upgrade_net_proto_text(commands)
-    _add_upgrade_net_proto_binary(commands)
-    _add_upgrade_solver_proto_text(commands)
+    parser = commands.add_parser("device_query", _device_query, help="show the GPUs (caffe device_query)")
+    parser.add_argument(
+        "--gpu", default="all", metavar="GPU", help="one number, several separated by commas, or all (the default)"
+    )
+    for name, (function, text) in _UPGRADES.items():
+        parser = commands.add_parser(name, function, help=text)
+        if function is _upgrade_net_proto_text:
+            add(parser, "plugin")
+        parser.add_argument("input", metavar="IN", help="the file to read")
+        parser.add_output("output", type=Path, metavar="OUT", help="the file to write")
 
 
 def _add_extract_features(commands: Commands) -> None:
-    parser = commands.add_parser("extract_features", help="write blobs to databases of float Datums (extract_features)")
-    parser.set_defaults(function=_extract_features, log_level=logging.WARNING)
-    add_plugin(parser)
-    add_limit(parser)
+    parser = commands.add_parser(
+        "extract_features", _extract_features, help="write blobs to databases of float Datums (extract_features)"
+    )
+    parser.set_defaults(log_level=logging.WARNING)
+    add(parser, "plugin", "limit")
     parser.add_argument("weights", metavar="WEIGHTS", help="the trained weights")
     parser.add_argument("model", metavar="MODEL", help="the net's prototxt, with a data layer")
     parser.add_argument("blobs", metavar="BLOBS", help="blob names, separated by commas")
@@ -57,14 +64,6 @@ def _extract_features(arguments: argparse.Namespace) -> None:
     net.close()
 
 
-def _add_device_query(commands: Commands) -> None:
-    parser = commands.add_parser("device_query", help="show the GPUs (caffe device_query)")
-    parser.set_defaults(function=_device_query)
-    parser.add_argument(
-        "--gpu", default="all", metavar="GPU", help="one number, several separated by commas, or all (the default)"
-    )
-
-
 def _device_query(arguments: argparse.Namespace) -> None:
     import torch
 
@@ -87,29 +86,11 @@ def _device_query(arguments: argparse.Namespace) -> None:
             log.info("common.cpp:178", f"{title:<31}{value}")
 
 
-def _add_files(parser: Parser) -> None:
-    parser.add_argument("input", metavar="IN", help="the file to read")
-    parser.add_output("output", type=Path, metavar="OUT", help="the file to write")
-
-
-def _add_upgrade_net_proto_text(commands: Commands) -> None:
-    parser = commands.add_parser("upgrade_net_proto_text", help="write a net's prototxt in the current format")
-    parser.set_defaults(function=_upgrade_net_proto_text)
-    add_plugin(parser)
-    _add_files(parser)
-
-
 def _upgrade_net_proto_text(arguments: argparse.Namespace) -> None:
     from netspec.proto.text import read_net, write_text
 
     write_whole(arguments.output, write_text(read_net(arguments.input)))
     log.info("upgrade_net_proto_text.cpp:49", f"Wrote upgraded NetParameter text proto to {arguments.output}")
-
-
-def _add_upgrade_net_proto_binary(commands: Commands) -> None:
-    parser = commands.add_parser("upgrade_net_proto_binary", help="write a .caffemodel in the current format")
-    parser.set_defaults(function=_upgrade_net_proto_binary)
-    _add_files(parser)
 
 
 def _upgrade_net_proto_binary(arguments: argparse.Namespace) -> None:
@@ -119,14 +100,15 @@ def _upgrade_net_proto_binary(arguments: argparse.Namespace) -> None:
     log.info("upgrade_net_proto_binary.cpp:49", f"Wrote upgraded NetParameter binary proto to {arguments.output}")
 
 
-def _add_upgrade_solver_proto_text(commands: Commands) -> None:
-    parser = commands.add_parser("upgrade_solver_proto_text", help="write a solver's prototxt in the current format")
-    parser.set_defaults(function=_upgrade_solver_proto_text)
-    _add_files(parser)
-
-
 def _upgrade_solver_proto_text(arguments: argparse.Namespace) -> None:
     from netspec.proto.text import read_solver, write_text
 
     write_whole(arguments.output, write_text(read_solver(arguments.input)))
     log.info("upgrade_solver_proto_text.cpp:49", f"Wrote upgraded SolverParameter text proto to {arguments.output}")
+
+
+_UPGRADES = {
+    "upgrade_net_proto_text": (_upgrade_net_proto_text, "write a net's prototxt in the current format"),
+    "upgrade_net_proto_binary": (_upgrade_net_proto_binary, "write a .caffemodel in the current format"),
+    "upgrade_solver_proto_text": (_upgrade_solver_proto_text, "write a solver's prototxt in the current format"),
+}

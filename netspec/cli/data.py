@@ -8,18 +8,13 @@ from pathlib import Path
 from netspec.cli.arguments import positive
 from netspec.errors import printable
 from netspec.terminal.commands import WrongUsage
-from netspec.terminal.parser import QUIET, Commands
+from netspec.terminal.parser import Commands
 
 
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
-    _add_show(commands.add_group("data", help="look at the records of a database"))
-    _add_plot(commands)
-
-
-def _add_show(commands: Commands) -> None:
-    parser = commands.add_parser("show", help="draw records with their keys and labels")
-    parser.set_defaults(function=_show, **QUIET)
+    data = commands.add_group("data", help="look at the records of a database")
+    parser = data.add_parser("show", _show, help="draw records with their keys and labels")
     parser.add_argument("source", metavar="DB", help="an LMDB or a LevelDB")
     parser.add_output("--out", required=True, metavar="F.png|svg", help="the image to write")
     parser.add_argument(
@@ -27,6 +22,16 @@ def _add_show(commands: Commands) -> None:
     )
     parser.add_argument(
         "--start", type=int, metavar="K", help="index of the first record to draw (default: evenly spaced ones)"
+    )
+    parser = commands.add_parser(
+        "plot", _plot, help="draw the curves of trainings from their logs, netspec's or Caffe's"
+    )
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training (its stderr)")
+    parser.add_output("--out", required=True, metavar="F.png|svg", help="the image to write")
+    parser.add_argument(
+        "--names",
+        metavar="NAMES,...",
+        help="names of the logs, separated by commas (default: the names of the files)",
     )
 
 
@@ -45,18 +50,6 @@ def _show(arguments: argparse.Namespace) -> None:
     title = f"{arguments.source}: {len(numbers)} of {len(reader):,} records"
     write_figure(sheet([read_record(reader, number) for number in numbers], title), arguments.out)
     print(f"{arguments.out}: {len(numbers)} of {len(reader):,} records")
-
-
-def _add_plot(commands: Commands) -> None:
-    parser = commands.add_parser("plot", help="draw the curves of trainings from their logs, netspec's or Caffe's")
-    parser.set_defaults(function=_plot, **QUIET)
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="log of a training (its stderr)")
-    parser.add_output("--out", required=True, metavar="F.png|svg", help="the image to write")
-    parser.add_argument(
-        "--names",
-        metavar="NAMES,...",
-        help="names of the logs, separated by commas (default: the names of the files)",
-    )
 
 
 def _plot(arguments: argparse.Namespace) -> None:

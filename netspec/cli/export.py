@@ -11,30 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from netspec import log
-from netspec.cli.arguments import (
-    add_engine,
-    add_exact,
-    add_gpu,
-    add_limit,
-    add_net,
-    add_part,
-    add_passes,
-    add_phase,
-    add_plugin,
-    add_python,
-    add_state,
-    add_steps,
-    add_strict,
-    add_verbose,
-    blob_shape,
-    choice,
-    device,
-    model,
-    options,
-    positive,
-    run_by,
-    stages,
-)
+from netspec.cli.arguments import add, blob_shape, choice, device, model, options, positive, run_by, stages
 from netspec.errors import SpecError
 from netspec.files.limits import amount
 from netspec.files.whole_file import whole_file
@@ -43,7 +20,7 @@ from netspec.proto.binary import split_paths
 from netspec.proto.schema import PHASES
 from netspec.terminal.commands import WrongUsage, refuse
 from netspec.terminal.output import bar
-from netspec.terminal.parser import QUIET, Commands
+from netspec.terminal.parser import Commands, Parser
 
 
 def add_commands(commands: Commands) -> None:
@@ -71,17 +48,11 @@ def _zooms(text: str) -> tuple[float, ...]:
 
 def _add_extract(commands: Commands) -> None:
     parser = commands.add_parser(
-        "extract", help="write blobs to an .npz file, for the records of a data layer or for images"
+        "extract", _extract, help="write blobs to an .npz file, for the records of a data layer or for images"
     )
-    parser.set_defaults(function=_extract, **QUIET)
-    add_verbose(parser)
-    add_plugin(parser)
-    add_limit(parser)
-    add_net(parser)
+    add(parser, "verbose", "plugin", "limit", "net")
     parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
-    parser.add_argument(
-        "--blob", action="extend", nargs="+", required=True, default=[], metavar="BLOB", help="the blobs to write"
-    )
+    add(parser, "blob", required=True, help="the blobs to write")
     parser.add_output("--out", type=Path, required=True, metavar="OUT", help="the .npz to write")
     parser.add_argument(
         "--source",
@@ -105,15 +76,23 @@ def _add_extract(commands: Commands) -> None:
     parser.add_argument(
         "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
     )
-    add_steps(parser)
-    add_gpu(parser)
-    add_phase(parser)
-    add_state(parser)
-    add_python(parser)
-    add_exact(parser)
-    add_passes(parser)
-    add_strict(parser)
-    add_engine(parser)
+    parser.add_argument("--swap", action="store_true", help="for image files: reverse the channels, from BGR to RGB")
+    parser.add_argument(
+        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply the pixels (0 to 255) by this"
+    )
+    parser.add_argument(
+        "--mean",
+        metavar="A,B,C|FILE",
+        help="then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
+    )
+    parser.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="then multiply by this; with any of these four options, the data layer's transform_param is not used",
+    )
+    add(parser, "gpu", "phase", "state", "python", "exact", "passes", "strict", "engine")
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -229,19 +208,17 @@ Data layers become inputs. Give their shapes with --shape if the prototxt does n
 def _add_export(commands: Commands) -> None:
     parser = commands.add_parser(
         "export",
+        _export,
         help="write a net as ONNX, PyTorch source or safetensors",
         description=EXPORT,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(function=_export, **QUIET)
-    add_verbose(parser)
-    add_plugin(parser)
-    add_limit(parser)
+    add(parser, "verbose", "plugin", "limit")
     parser.add_argument("file", metavar="FILE", help="the net's prototxt")
     parser.add_argument("--to", required=True, choices=list(WRITTEN), help="the format")
     parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
     parser.add_output("--out", type=Path, required=True, metavar="OUT", help="the file to write")
-    add_part(parser)
+    _add_part(parser)
     parser.add_argument(
         "--no-labels", action="store_true", help="leave out labels, and the losses and accuracies that need them"
     )
@@ -284,12 +261,16 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {WRITTEN[arguments.to]}, {amount(arguments.out.stat().st_size)}")
 
 
+def _add_part(parser: Parser) -> None:
+    """Add the options that choose the part of a net to write."""
+    add(parser, "blob", help="only the layers that compute these blobs")
+    add(parser, "shape", help="the shape of an input or a data layer's top")
+    add(parser, "phase", "state", "python")
+
+
 def _add_fold(commands: Commands) -> None:
-    parser = commands.add_parser("fold", help="fold BatchNorm and Scale layers into the layers before them")
-    parser.set_defaults(function=_fold, **QUIET)
-    add_verbose(parser)
-    add_plugin(parser)
-    add_limit(parser)
+    parser = commands.add_parser("fold", _fold, help="fold BatchNorm and Scale layers into the layers before them")
+    add(parser, "verbose", "plugin", "limit")
     parser.add_argument(
         "file", metavar="MODEL", help="the net's prototxt; the labels and losses of a training net are removed"
     )
@@ -298,7 +279,7 @@ def _add_fold(commands: Commands) -> None:
     parser.add_output(
         "--out", ends=ends, type=Path, required=True, metavar="PREFIX", help=f"write PREFIX{' and PREFIX'.join(ends)}"
     )
-    add_part(parser)
+    _add_part(parser)
 
 
 def _fold(arguments: argparse.Namespace) -> None:

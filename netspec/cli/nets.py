@@ -8,23 +8,12 @@ import shutil
 import sys
 from pathlib import Path
 
-from netspec.cli.arguments import (
-    add_limit,
-    add_passes,
-    add_phase,
-    add_plugin,
-    add_python,
-    add_shapes,
-    add_state,
-    add_strict,
-    add_verbose,
-    options,
-)
+from netspec.cli.arguments import add, options
 from netspec.errors import printable
 from netspec.files.limits import no_collection
 from netspec.proto.schema import PHASES, TEST, TRAIN
 from netspec.terminal.commands import DONE, SOMETHING, UNREADABLE, WrongUsage, refuse
-from netspec.terminal.parser import QUIET, Commands
+from netspec.terminal.parser import Commands
 
 
 def add_commands(commands: Commands) -> None:
@@ -33,22 +22,18 @@ def add_commands(commands: Commands) -> None:
     _add_lint(commands)
     _add_draw(commands)
     _add_diff(commands)
-    _add_layers(commands)
+    add(commands.add_parser("layers", _layers, help="list the layer types, each with its description"), "plugin")
 
 
 def _add_check(commands: Commands) -> None:
     parser = commands.add_parser(
-        "check", help="build a net, or a solver's nets, and report all errors; no file is written"
+        "check", _check, help="build a net, or a solver's nets, and report all errors; no file is written"
     )
-    parser.set_defaults(function=_check, **QUIET)
-    add_verbose(parser)
-    add_plugin(parser)
-    add_limit(parser)
+    add(parser, "verbose", "plugin", "limit")
     parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
-    add_phase(parser)
-    add_state(parser)
-    add_shapes(parser, "shape of a data layer's top, instead of opening its data")
-    parser.add_argument("--data", action="store_true", help="open databases, lists and mean files too")
+    add(parser, "phase", "state")
+    add(parser, "shape", help="shape of a data layer's top, instead of opening its data")
+    add(parser, "data")
     parser.add_argument(
         "--weights", metavar="WEIGHTS", help="check that these weights fit the net; several separated by commas"
     )
@@ -57,14 +42,13 @@ def _add_check(commands: Commands) -> None:
         action="store_true",
         help="print the steps in which the net runs without gradients; this allocates its memory",
     )
-    add_passes(parser)
+    add(parser, "passes")
     parser.add_argument(
         "--json",
         action="store_true",
         help="print blobs, params, inputs and outputs as JSON, or the errors if there are any",
     )
-    add_strict(parser)
-    add_python(parser)
+    add(parser, "strict", "python")
 
 
 @no_collection()  # of the whole command: of the text and the table too
@@ -113,18 +97,16 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _add_lint(commands: Commands) -> None:
-    parser = commands.add_parser("lint", help="find probable mistakes in nets and solvers")
-    parser.set_defaults(function=_lint, **QUIET)
-    add_plugin(parser)
+    parser = commands.add_parser("lint", _lint, help="find probable mistakes in nets and solvers")
+    add(parser, "plugin")
     parser.add_argument("files", nargs="*", default=[], metavar="FILE", help="a net's or a solver's prototxt")
     parser.add_argument("--rules", action="store_true", help="print the rules and their reasons")
     parser.add_argument(
         "--json", action="store_true", help="print errors and findings as JSON, one object for each file"
     )
-    add_state(parser)
-    add_shapes(parser, "the shape of a data layer's top; some rules need shapes")
-    parser.add_argument("--data", action="store_true", help="open databases, lists and mean files")
-    add_python(parser)
+    add(parser, "state")
+    add(parser, "shape", help="the shape of a data layer's top; some rules need shapes")
+    add(parser, "data", "python")
 
 
 def _lint(arguments: argparse.Namespace) -> int:
@@ -158,21 +140,18 @@ FORMATS = (".svg", ".png", ".html")
 
 
 def _add_draw(commands: Commands) -> None:
-    parser = commands.add_parser("draw", help="draw a net: layers, shapes, shared parameters, multiply-adds")
-    parser.set_defaults(function=_draw, **QUIET)
-    add_plugin(parser)
+    parser = commands.add_parser("draw", _draw, help="draw a net: layers, shapes, shared parameters, multiply-adds")
+    add(parser, "plugin")
     parser.add_argument("file", metavar="FILE", help="a net, or a solver (its training net is drawn)")
     parser.add_output("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
-    parser.add_argument(
-        "--phase", type=str.upper, choices=["TEST", "TRAIN"], help="only this phase (default: both in one)"
-    )
-    add_state(parser)
-    add_shapes(parser, "the shape of a data layer's top, if it is not known from the prototxt")
-    parser.add_argument("--data", action="store_true", help="open databases and lists to learn their shapes")
+    add(parser, "phase", default=None, help="only this phase (default: both in one)")
+    add(parser, "state")
+    add(parser, "shape", help="the shape of a data layer's top, if it is not known from the prototxt")
+    add(parser, "data", help="open databases and lists to learn their shapes")
     parser.add_argument(
         "--unfold", action="store_true", help="draw every copy of a repeated block (an HTML page has both forms)"
     )
-    add_python(parser)
+    add(parser, "python")
 
 
 def _draw(arguments: argparse.Namespace) -> None:
@@ -204,10 +183,10 @@ def _tolerance(text: str) -> float:
 
 def _add_diff(commands: Commands) -> None:
     parser = commands.add_parser(
-        "diff", help="print how two nets, solvers or weights differ, ignoring their formatting"
+        "diff", _diff, help="print how two nets, solvers or weights differ, ignoring their formatting"
     )
-    parser.set_defaults(function=_diff, **QUIET, fault_status=UNREADABLE)
-    add_plugin(parser)
+    parser.set_defaults(fault_status=UNREADABLE)
+    add(parser, "plugin")
     parser.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
     parser.add_argument("second", metavar="B", help="another of the same kind")
     parser.add_argument(
@@ -229,13 +208,10 @@ def _diff(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _add_layers(commands: Commands) -> None:
-    parser = commands.add_parser("layers", help="list the layer types, each with its description")
-    parser.set_defaults(function=_layers, **QUIET)
-    add_plugin(parser)
-
-
 def _layers(arguments: argparse.Namespace) -> None:
-    from netspec.inspect.layer_types import layer_lines
+    """Print each layer type with the first line of the docstring of its class."""
+    from netspec.layers import layer_class, layer_types
 
-    print("\n".join(layer_lines()))
+    for name in layer_types():
+        cls = layer_class(name)
+        print(f"{name:28} {((cls and cls.__doc__) or '').strip().splitlines()[0]}")

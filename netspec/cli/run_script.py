@@ -7,11 +7,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from netspec.cli.arguments import add_limit, add_plugin
+from netspec.cli.arguments import add
 from netspec.files.limits import LIMIT
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import VARIABLE
-from netspec.terminal.parser import NO_LOG, Commands
+from netspec.terminal.parser import Commands
 
 NAME = "run"
 _WITH_VALUE = ("--plugin", "--minloglevel", "--limit")
@@ -19,9 +19,27 @@ _WITH_VALUE = ("--plugin", "--minloglevel", "--limit")
 
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
-    _add_run(commands)
-    _add_install_caffe(commands)
-    _add_remove_caffe(commands)
+    parser = commands.add_parser(
+        NAME,
+        _run,
+        help="run a Python 3 script in which `import caffe` imports netspec",
+        usage="netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]",
+    )
+    add(parser, "plugin", "limit")
+    parser.add_argument("-m", action="store_true", help="run a module, as python -m does")
+    parser = commands.add_parser(
+        "install-caffe",
+        _install_caffe,
+        help="put a package `caffe` and Caffe's commands into this Python environment",
+    )
+    parser.add_argument(
+        "--build",
+        type=Path,
+        metavar="FOLDER",
+        help="only create FOLDER/tools/caffe and so on, for shell scripts that call build/tools/caffe",
+    )
+    parser = commands.add_parser("remove-caffe", _remove_caffe, help="undo install-caffe")
+    parser.add_argument("--build", type=Path, metavar="FOLDER", help="undo install-caffe --build FOLDER")
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -34,18 +52,6 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
             break
         position += name in _WITH_VALUE
     return list(words[:position]), list(words[position:])
-
-
-def _add_run(commands: Commands) -> None:
-    parser = commands.add_parser(
-        NAME,
-        help="run a Python 3 script in which `import caffe` imports netspec",
-        usage="netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]",
-    )
-    parser.set_defaults(function=_run, **NO_LOG)
-    add_plugin(parser)
-    add_limit(parser)
-    parser.add_argument("-m", action="store_true", help="run a module, as python -m does")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -65,19 +71,6 @@ def _run(arguments: argparse.Namespace) -> None:
     run(name, own)
 
 
-def _add_install_caffe(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "install-caffe", help="put a package `caffe` and Caffe's commands into this Python environment"
-    )
-    parser.set_defaults(function=_install_caffe)
-    parser.add_argument(
-        "--build",
-        type=Path,
-        metavar="FOLDER",
-        help="only create FOLDER/tools/caffe and so on, for shell scripts that call build/tools/caffe",
-    )
-
-
 def _install_caffe(arguments: argparse.Namespace) -> None:
     from netspec.compat.scripts.environment import install_caffe, make_build_folder
 
@@ -88,12 +81,6 @@ def _install_caffe(arguments: argparse.Namespace) -> None:
         print(f"Caffe's commands are in {arguments.build}; netspec remove-caffe --build removes them")
     else:
         print("import caffe and Caffe's commands now use netspec; netspec remove-caffe undoes this")
-
-
-def _add_remove_caffe(commands: Commands) -> None:
-    parser = commands.add_parser("remove-caffe", help="undo install-caffe")
-    parser.set_defaults(function=_remove_caffe)
-    parser.add_argument("--build", type=Path, metavar="FOLDER", help="undo install-caffe --build FOLDER")
 
 
 def _remove_caffe(arguments: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import takewhile
 from typing import Any
 
@@ -19,6 +19,7 @@ from netspec.files.whole_file import why_no_folder, why_unwritable
 from netspec.terminal.commands import FAULT
 from netspec.terminal.output import GlogFormatter
 
+Command = Callable[[argparse.Namespace], int | None]
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 
 # Defaults of a command (``parser.set_defaults``) for its log.
@@ -113,27 +114,27 @@ class Parser(argparse.ArgumentParser):
 class Commands:
     """The commands of a parser, whose help lists them under headings.
 
-    ``heading`` is the heading for the commands that are added next. ``defaults`` are those of every command, as for
+    ``heading`` is the heading for the commands that are added next, and ``defaults`` are their defaults, as for
     ``parser.set_defaults``, for example ``**QUIET``.
     """
 
     def __init__(self, parser: Parser, **defaults: Any) -> None:
         self.heading = "commands"
         self._parser = parser
-        self._defaults = {**CAFFES_LOG, **defaults}
+        self.defaults = {**CAFFES_LOG, **defaults}
         self._listed: dict[str, list[str]] = {}
         self._subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
         parser.formatter_class = _Overview
 
-    def add_parser(self, name: str, *, help: str, **options: Any) -> Parser:
+    def add_parser(self, name: str, function: Command, *, help: str, **options: Any) -> Parser:
         """Add a command as argparse's ``add_parser`` does, with glog's flags; ``help`` is its description too.
 
-        The command sets the default ``function``, which is called with the namespace and returns the exit status, or
-        None for 0. ``prepare``, if it is set, is called first. ``fault_status`` is the exit status for a fault in the
-        user's files.
+        ``function`` is called with the namespace and returns the exit status, or None for 0. The default ``prepare``,
+        if it is set, is called first. ``fault_status`` is the exit status for a fault in the user's files.
         """
         parser = self._add(name, help=help, **options)
-        parser.set_defaults(prog=parser.prog, prepare=None, outputs={}, fault_status=FAULT, **self._defaults)
+        own = {"function": function, "prog": parser.prog}
+        parser.set_defaults(**{"prepare": None, "outputs": {}, "fault_status": FAULT, **self.defaults, **own})
         parser.add_argument("--minloglevel", type=int, choices=range(4), help=argparse.SUPPRESS)
         parser.add_argument("-q", dest="minloglevel", action="store_const", const=1, help=argparse.SUPPRESS)
         for flag in ("--logtostderr", "--alsologtostderr"):  # it always does
@@ -143,7 +144,7 @@ class Commands:
 
     def add_group(self, name: str, *, help: str) -> Commands:
         """Add a command that has commands of its own; return them."""
-        return Commands(self._add(name, help=help), **self._defaults)
+        return Commands(self._add(name, help=help), **self.defaults)
 
     def _add(self, name: str, *, help: str, **options: Any) -> Parser:
         self._listed.setdefault(self.heading, []).append(f"  {name:25} {help}")

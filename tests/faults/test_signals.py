@@ -27,7 +27,7 @@ def endless(arguments):
         time.sleep({cleaning})
 
 parser = Parser()
-Commands(parser).add_parser("endless", help="").set_defaults(function=endless)
+Commands(parser).add_parser("endless", endless, help="")
 sys.exit(run(parser, ["endless"]))
 """
 IMPORTED = """

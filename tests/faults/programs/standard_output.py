@@ -5,7 +5,7 @@ from netspec.terminal.parser import Commands, Parser
 
 def main(words):
     parser = Parser()
-    Commands(parser).add_parser("say", help="").set_defaults(function=lambda arguments: print(*words))
+    Commands(parser).add_parser("say", lambda arguments: print(*words), help="")
     return run(parser, ["say"])
 
 sys.modules["commands"] = types.SimpleNamespace(main=main)

@@ -18,8 +18,7 @@ from netspec.terminal.parser import Commands, Parser
 
 def command(function: Callable[[argparse.Namespace], int | None]) -> Parser:
     parser = Parser("program")
-    added = Commands(parser).add_parser("convert", help="a command")
-    added.set_defaults(function=function)
+    added = Commands(parser).add_parser("convert", function, help="a command")
     added.add_argument("--gray", action="store_true", help="read images as gray")
     added.add_argument("--train", action="store_true", default=True)
     added.add_argument("--check_size", action="store_true")
@@ -118,9 +117,8 @@ def test_given_options_can_be_refused(capsys: pytest.CaptureFixture[str]) -> Non
 def test_commands_in_groups_have_their_own_options() -> None:
     parser = Parser("program")
     group = Commands(parser).add_group("look", help="commands that draw")
-    maps = group.add_parser("maps", help="draw maps")
     found: list[argparse.Namespace] = []
-    maps.set_defaults(function=found.append)
+    maps = group.add_parser("maps", found.append, help="draw maps")
     maps.add_argument("-v", action="store_true")
     maps.add_argument("--out")
     assert run(parser, ["look", "maps", "-v", "-out", "a.png"]) == 0
@@ -149,9 +147,8 @@ def test_outputs_are_checked_before_the_command_begins(
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     parser = Parser("program")
-    command = Commands(parser).add_parser("draw", help="draw")
     began: list[argparse.Namespace] = []
-    command.set_defaults(function=began.append)
+    command = Commands(parser).add_parser("draw", began.append, help="draw")
     command.add_output("--out", folder=folder)
     assert run(parser, ["draw", "--out", out]) == (1 if line else 0)
     assert capsys.readouterr().err == line
@@ -160,9 +157,8 @@ def test_outputs_are_checked_before_the_command_begins(
 
 def test_a_flag_of_one_letter_has_no_opposite(capsys: pytest.CaptureFixture[str]) -> None:
     parser = Parser("program")
-    added = Commands(parser).add_parser("convert", help="a command")
     found: list[argparse.Namespace] = []
-    added.set_defaults(function=found.append)
+    added = Commands(parser).add_parser("convert", found.append, help="a command")
     added.add_argument("-m", action="store_true", help="run a module")
     assert run(parser, ["convert"]) == run(parser, ["convert", "-m"]) == 0
     assert [arguments.m for arguments in found] == [False, True]
