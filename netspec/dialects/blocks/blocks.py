@@ -5,6 +5,7 @@ If two forks have different layers with the same type (BN, Upsample), the given 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from netspec.dialects.segmentation.segnet import BN, Upsample
 from netspec.layers import Layer, register
 from netspec.layers.contract.base import Shape
 from netspec.layers.vision.convolution import Convolution
-from netspec.proto.schema import LayerParameter, value
+from netspec.proto.schema import value
 
 DECLARATIONS = """
 message InterpParameter {
@@ -141,10 +142,8 @@ class DepthwiseConvolution(Convolution):
     def setup(self) -> None:
         """Set up like Convolution; raise SpecError for filters over more than one channel."""
         if not self.param.convolution_param.HasField("group"):
-            param = LayerParameter()
-            param.CopyFrom(self.param)
-            param.convolution_param.group = self.bottom_shapes[0][1] if len(self.bottom_shapes[0]) > 1 else 1
-            self.param = param
+            self.param = copy.deepcopy(self.param)
+            self.param.convolution_param.group = self.bottom_shapes[0][1] if len(self.bottom_shapes[0]) > 1 else 1
         super().setup()
         if self.group != self.channels:
             message = f"group must be the number of channels, {self.channels}, found {self.group}"

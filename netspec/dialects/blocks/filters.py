@@ -191,9 +191,6 @@ class ReLU(Capped):
     Fork: foss-for-synopsys-dwc-arc-processors/synopsys-caffe, src/caffe/layers/relu_layer.cpp
     """
 
-    def setup(self) -> None:
-        self.slope: float = self.param.relu_param.negative_slope
-
 
 @replace(
     "Dropout",

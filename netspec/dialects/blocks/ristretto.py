@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from netspec.dialects.rcnn.regions import whole
 from netspec.layers import Layer, register
 from netspec.layers.common import InnerProduct
 from netspec.layers.vision.convolution import Convolution, Deconvolution
@@ -42,21 +43,15 @@ FIXED_POINT, MINIFLOAT = 0, 1  # QuantizationParameter.Precision
 NEAREST = 0  # QuantizationParameter.Rounding
 
 
-def rounded_half_up(x: torch.Tensor) -> torch.Tensor:
-    """Round to integers, halves away from zero, like C's round; computed in double, where a half is exact."""
-    return torch.sign(x) * torch.floor(x.abs() + 0.5)
-
-
 def fixed_point(x: torch.Tensor, bits: int, fraction: int) -> torch.Tensor:
     """Return the nearest fixed-point numbers with ``bits`` bits, ``fraction`` of them fractional, with saturation."""
     step, most = 2.0**-fraction, 2.0 ** (bits - 1)
-    whole = rounded_half_up(x.double().clamp(-most * step, (most - 1) * step) / step)
-    return (whole * step).to(x)
+    return (whole(x.double().clamp(-most * step, (most - 1) * step) / step) * step).to(x)
 
 
 def power_of_two(x: torch.Tensor, least: int, most: int) -> torch.Tensor:
     """Round x to plus or minus a power of two between 2^least and 2^most."""
-    exponent = rounded_half_up(x.abs().log2().double()).clamp(least, most)
+    exponent = whole(x.abs().log2().double()).clamp(least, most)
     return torch.where(x >= 0, 1.0, -1.0) * torch.exp2(exponent).to(x)
 
 

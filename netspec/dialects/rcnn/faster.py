@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from netspec.data.images import read_image
-from netspec.dialects.boxes import Array, as_array
+from netspec.dialects.boxes import Array, as_array, overlaps
 from netspec.dialects.rcnn.proposals import all_anchors, base_anchors
 from netspec.dialects.rcnn.smooth import four
 from netspec.errors import SpecError
@@ -66,13 +66,10 @@ def anchors_of(found: Mapping[str, Any]) -> Array:
     return base_anchors(16, found.get("ratios", RATIOS), found.get("scales", SCALES))
 
 
-def overlaps(boxes: Array, others: Array) -> Array:
-    """Return the intersection over union of each of (n, 4) with each of (m, 4): (n, m)."""
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    shared = np.prod(np.maximum(high - low + 1, 0), axis=2)
-    areas, other_areas = (np.prod(b[:, 2:] - b[:, :2] + 1, axis=1) for b in (boxes, others))
-    return shared / (areas[:, None] + other_areas - shared)
+def pixel_overlaps(boxes: Array, others: Array) -> Array:
+    """Return the intersection over union of each of (n, 4) with each of (m, 4) in double precision: (n, m)."""
+    pixel = np.array([0, 0, 1, 1], np.float64)  # a box of pixels includes its last row and column
+    return overlaps(boxes[:, None] + pixel, others[None] + pixel)
 
 
 def targets(boxes: Array, truth: Array) -> Array:
@@ -143,7 +140,7 @@ class AnchorTarget(_Sampling):
         inside = np.flatnonzero((anchors[:, :2] >= -self.border).all(1) & (anchors[:, 2:] < end).all(1))
         labels, moves = np.full(len(anchors), -1), np.zeros((len(anchors), 4), np.float32)
         if len(inside) and len(truth):
-            table = overlaps(anchors[inside].astype(np.float64), truth[:, :4].astype(np.float64))
+            table = pixel_overlaps(anchors[inside], truth[:, :4])
             most = table.max(axis=1)
             labels[inside[most < ANCHOR_BACKGROUND]] = 0
             labels[inside[(table == table.max(axis=0)).any(axis=1) | (most >= ANCHOR_OBJECT)]] = 1
@@ -230,7 +227,7 @@ class ProposalTarget(_Sampling):
         regions = np.concatenate([as_array(proposals), own])
         best, which = np.zeros(len(regions)), np.zeros(len(regions), int)
         if len(truth):
-            table = overlaps(regions[:, 1:].astype(np.float64), truth[:, :4].astype(np.float64))
+            table = pixel_overlaps(regions[:, 1:], truth[:, :4])
             best, which = table.max(axis=1), table.argmax(axis=1)
         objects = self.choose(np.flatnonzero(best >= REGION_OBJECT), self.objects)
         others = self.choose(np.flatnonzero(best < REGION_OBJECT), self.regions - len(objects))

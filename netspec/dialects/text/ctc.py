@@ -20,6 +20,12 @@ from netspec.proto.schema import value
 LOSS, DECODER = "ctc_loss_param", "ctc_decoder_param"
 
 
+def check_scores(layer: Layer, scores: Shape) -> None:
+    """Raise SpecError for scores that are not (T, N, C)."""
+    if len(scores) < 3 or any(size != 1 for size in scores[3:]):
+        raise layer.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
+
+
 def _collapsed(classes: Iterable[int], blank: int, merge: bool) -> list[int]:
     """Return the labels of a path without blanks; with ``merge``, runs of equal labels count once."""
     before, found = -1, []
@@ -58,8 +64,7 @@ class CTCGreedyDecoder(Layer):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores = bottom_shapes[0]
-        if len(scores) < 3 or any(size != 1 for size in scores[3:]):
-            raise self.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
+        check_scores(self, scores)
         if len(bottom_shapes) > 1 and bottom_shapes[1][:1] != scores[1:2]:
             raise self.error(f"found labels of shape {bottom_shapes[1]}, expected ({scores[1]}, L)", "bottom", 1)
         return [(1, 2, 1, 1) if len(bottom_shapes) > 1 else (scores[1], scores[0], 1, 1)]
@@ -127,11 +132,6 @@ class _CtcLoss(Layer):
     label_bottoms = frozenset({1, 2, 3})
     not_exported = "it is for training"
 
-    def check_scores(self, scores: Shape) -> None:
-        """Raise SpecError for scores that are not (T, N, C)."""
-        if len(scores) < 3 or any(size != 1 for size in scores[3:]):
-            raise self.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
-
     def loss(self, scores: torch.Tensor, texts: Sequence[Sequence[int]], steps: Sequence[int], blank: int) -> Any:
         """Return the mean of the costs, with the gradient of their sum, for the text and the steps of each sequence.
 
@@ -178,7 +178,7 @@ class CTCLoss(_CtcLoss):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of the scalar top; the bottoms must have equal numbers of sequences."""
         scores, *others = bottom_shapes
-        self.check_scores(scores)
+        check_scores(self, scores)
         items = scores[1]
         axes = {1: [0], 2: [1, 1], 3: [0, 0, 1]}[len(others)]
         for i, (shape, axis) in enumerate(zip(others, axes, strict=True), 1):
@@ -206,16 +206,6 @@ class CTCLoss(_CtcLoss):
         return self.loss(scores, texts, steps, blank)
 
 
-class WarpCTCLoss(CTCLoss):
-    """Another name of CTCLoss.
-
-    bottom[0]  scores (T, N, C), before the softmax
-    bottom[i]  as for CTCLoss
-    top[0]     the loss, ()
-    Fork: senlinuc/caffe_ocr, src/caffe/layers/warp_ctc_loss_layer.cpp
-    """
-
-
 class CtcLoss(_CtcLoss):
     """The CTC loss of xmfbit/warpctc-caffe: the mean of -log of the probability of each text, over all time_step steps.
 
@@ -235,7 +225,7 @@ class CtcLoss(_CtcLoss):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         scores, labels = bottom_shapes
-        self.check_scores(scores)
+        check_scores(self, scores)
         param = self.settings
         if labels[:1] != scores[1:2] or scores[2] != param.alphabet_size or scores[0] < param.time_step:
             expected = f"({param.time_step}, N, {param.alphabet_size}) and (N, L)"

@@ -6,6 +6,7 @@ which run only on GPUs, with cuDNN).
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +22,7 @@ from netspec.layers.contract.base import Shape
 from netspec.layers.vision.convolution import Convolution
 from netspec.layers.vision.pooling import AVE, MAX, STOCHASTIC
 from netspec.layers.vision.windows import LOWEST
-from netspec.proto.schema import LayerParameter, has, value
+from netspec.proto.schema import has, value
 
 DECLARATIONS = """
 message Convolution3DParameter {
@@ -66,13 +67,6 @@ extend LayerParameter {
 SHAPES = ("kernel_shape", "stride_shape", "pad_shape")
 
 
-def _copied_param(layer: Layer) -> LayerParameter:
-    """Return a copy of the layer's parameters with the fork's fields converted to Caffe's."""
-    param = LayerParameter()
-    param.CopyFrom(layer.param)
-    return param
-
-
 @register("Convolution3D", "convolution3d_param")
 class Convolution3D(Convolution):
     """Caffe's Convolution over time, height and width.
@@ -93,7 +87,7 @@ class Convolution3D(Convolution):
         if len(self.bottom_shapes[0]) != 5:
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, L, H, W)", "bottom", 0)
         check_at_least_1(self, "convolution3d_param", "kernel_size", "kernel_depth")
-        self.param = _copied_param(self)
+        self.param = copy.deepcopy(self.param)
         param = self.param.convolution_param
         param.num_output, param.bias_term = given.num_output, given.bias_term
         param.kernel_size.extend((given.kernel_depth, given.kernel_size, given.kernel_size))
@@ -120,7 +114,7 @@ class NdConvolution(Convolution):
         kernel, stride, pad = _shapes(self, "convolution_param")
         if not kernel:
             raise self.error("kernel_shape is missing", "convolution_param")
-        self.param = _copied_param(self)
+        self.param = copy.deepcopy(self.param)
         param = self.param.convolution_param
         for name, numbers in (("kernel_size", kernel), ("stride", stride), ("pad", pad)):
             getattr(param, name)[:] = numbers

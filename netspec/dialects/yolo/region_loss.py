@@ -13,12 +13,20 @@ from typing_extensions import override
 
 from netspec.dialects.boxes import Array, around, as_array, overlaps, sigmoid
 from netspec.dialects.gradients import with_gradient_of
-from netspec.layers.contract.base import Shape
+from netspec.layers.contract.base import Layer, Shape
 from netspec.layers.loss.base import Loss
 from netspec.proto.schema import value
 
 MSE = 2  # Yolov3Parameter.IOU_LOSS
 OBJECT, CLASSES = 4, 5  # their index in a box; x, y, width and height come before
+
+
+def read_anchors(layer: Layer, group: str) -> Array:
+    """Return the sizes of the prior boxes (n, 2), the ``biases`` of a layer. Raises SpecError."""
+    biases = value(layer.param, group).biases
+    if len(biases) % 2 or not biases:
+        raise layer.error(f"found {len(biases)} biases, expected pairs of width and height", group, "biases")
+    return np.array(biases, np.float32).reshape(-1, 2)
 
 
 class _DarknetLoss(Loss):
@@ -28,10 +36,8 @@ class _DarknetLoss(Loss):
     not_exported = "it is for training"
 
     def setup(self) -> None:
-        self.settings = param = value(self.param, self.group)
-        if len(param.biases) % 2 or not param.biases:
-            raise self.error(f"found {len(param.biases)} biases, expected pairs", self.group, "biases")
-        self.anchors = np.array(param.biases, np.float32).reshape(-1, 2)
+        self.settings = value(self.param, self.group)
+        self.anchors = read_anchors(self, self.group)
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of the scalar top; the map must have the channels of its boxes."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from typing_extensions import override
 
 from netspec.dialects.boxes import Array, around, as_array, detections, overlaps, sigmoid
 from netspec.dialects.gradients import with_gradient_of
-from netspec.dialects.yolo.region_loss import CLASSES, OBJECT, RegionLoss, Yolov3
+from netspec.dialects.yolo.region_loss import CLASSES, OBJECT, RegionLoss, Yolov3, read_anchors
 from netspec.layers import Layer, register
 from netspec.layers.activation import Activation
 from netspec.layers.contract.base import Shape
@@ -161,13 +160,6 @@ class _YoloOutput(Layer):
         return np.concatenate([numbers, found[kept, :2] + [1, 0], corners[kept]], axis=1, dtype=np.float32)
 
 
-def _anchors(param: Any, layer: Layer, group: str) -> Array:
-    """Return the sizes of the prior boxes (n, 2)."""
-    if len(param.biases) % 2:
-        raise layer.error(f"found {len(param.biases)} biases, expected pairs of width and height", group, "biases")
-    return np.array(param.biases, np.float32).reshape(-1, 2)
-
-
 @register("YoloDetectionOutput", "yolo_detection_output_param")
 class YoloDetectionOutput(_YoloOutput):
     """Turn YOLO v2's maps into detections: the most probable class of each box, times the probability of an object.
@@ -183,7 +175,7 @@ class YoloDetectionOutput(_YoloOutput):
 
     def setup(self) -> None:
         param = value(self.param, self.group)
-        self.anchors = _anchors(param, self, self.group)
+        self.anchors = read_anchors(self, self.group)
         if len(self.anchors) != param.num_box or param.coords != OBJECT:
             found = f"found {len(self.anchors)} and coords {param.coords}"
             message = f"expected a pair of biases for each of num_box {param.num_box}, and coords 4; {found}"
@@ -217,7 +209,7 @@ class Yolov3DetectionOutput(_YoloOutput):
 
     def setup(self) -> None:
         param = value(self.param, self.group)
-        anchors, maps = _anchors(param, self, self.group), len(self.bottom_shapes)
+        anchors, maps = read_anchors(self, self.group), len(self.bottom_shapes)
         if param.mask_group_num != maps or len(param.anchors_scale) < maps:
             found = f"found mask_group_num {param.mask_group_num} and {len(param.anchors_scale)} anchors_scale"
             message = f"expected mask_group_num {maps}, the number of bottoms, and an anchors_scale for each; {found}"
