@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
-from benchmarks.rounds import CaffeProgram, Contestant, Pass, Worker, difference, measure, ratio
+from benchmarks.rounds import Contestant, Pass, Worker, difference, measure, ratio
 
-IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")
+SEPARATE = "opencv4"  # the program that needs a separate environment
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,7 @@ class Comparison:
 
     programs         the programs and engines to compare, such as netspec-onnxruntime
     training         whether a pass is a training iteration, and not a forward pass
-    separate_python  the Python of a separate environment, for the programs that need it
-    caffe            the caffe binary, if it is timed too
+    separate_python  the Python of a separate environment, for the program that needs it
     limit            the rounds take at most this many seconds, but there are at least three
     device           the torch device for trainings by netspec and by PyTorch alone
     """
@@ -31,7 +30,6 @@ class Comparison:
     training: bool
     rounds: int
     separate_python: str | None = None
-    caffe: str | None = None
     limit: float = math.inf
     device: str = "cpu"
 
@@ -41,8 +39,6 @@ def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
     task = {**task_of(case, threads), "device": how.device}
     suffix = "_training" if how.training else ""
     contestants = [_worker(case, program, task, suffix, how.separate_python) for program in how.programs]
-    if how.caffe:
-        contestants.append(CaffeProgram(how.caffe, task, training=how.training))
     able = [one for one in contestants if not one.fault]
     try:
         times = measure(able, how.rounds, lambda k: _show_progress(case, threads, k, how.rounds), how.limit)
@@ -50,14 +46,7 @@ def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
         for one in contestants:
             one.close()
     _show_progress(case, threads, how.rounds, how.rounds)
-    return rows_of_times(case, threads, contestants, times, "training" if how.training else "forward")
-
-
-def rows_of_times(
-    case: Case, threads: int, contestants: Sequence[Contestant], times: Mapping[str, Sequence[Pass]], what: str
-) -> list[Row]:
-    """Return a row for each contestant; ``times``: those that were measured, by name."""
-    able = [one for one in contestants if not one.fault]
+    what = "training" if how.training else "forward"
     expected = next((one.outputs for one in able if one.name == "netspec"), None)
     seconds = {name: [clock for clock, _ in passes] for name, passes in times.items()}
     rows = []
@@ -67,11 +56,7 @@ def rows_of_times(
         ratios = {
             name: ratio(own, seconds[name]) for name in REFERENCES if own and name in seconds and name != one.name
         }
-        spent = {
-            name: ratio(computing, [used for _, used in times[name]])
-            for name in ratios
-            if not any(math.isnan(used) for _, used in (*times[name], *times[one.name]))
-        }
+        spent = {name: ratio(computing, [used for _, used in times[name]]) for name in ratios}
         off = difference(one.outputs, expected) if expected and one.name != "netspec" and one.outputs else None
         rows.append(
             Row(case.name, case.batch, threads, one.name, own, computing, ratios, off, one.fault, spent, one.peak, what)
@@ -88,8 +73,7 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     outputs = sorted({blob for layer in message.layer for blob in layer.top} - read)
     return {
         **{
-            name: str(getattr(case, name))
-            for name in ("prototxt", "caffemodel", "torch", "onnx", "inputs", "solver", "folder")
+            name: str(getattr(case, name)) for name in ("prototxt", "caffemodel", "torch", "inputs", "solver", "folder")
         },
         "cache": str(case.folder / "cache"),
         **{"outputs": outputs, "threads": threads, "device": "cpu"},
@@ -101,7 +85,8 @@ def _worker(case: Case, program: str, task: dict[str, Any], suffix: str, separat
     name, options = parts(program)
     if name == "pytorch" and not case.torch.is_file():
         return _Absent(program, "netspec export --to torch cannot write this net")
-    return Worker(program, python_of(program, separate_python), {**task, **options, "program": name + suffix})
+    python = separate_python if separate_python and program == SEPARATE else sys.executable
+    return Worker(program, python, {**task, **options, "program": name + suffix})
 
 
 def parts(program: str) -> tuple[str, dict[str, str]]:
@@ -109,11 +94,6 @@ def parts(program: str) -> tuple[str, dict[str, str]]:
     name, *rest = program.split("-")
     precision = rest.pop() if rest[-1:] == ["bf16"] else "fp32"
     return name, {"engine": rest[0] if rest else "torch", "precision": precision}
-
-
-def python_of(program: str, separate_python: str | None) -> str:
-    """Return the path of the Python that has the library that a program needs."""
-    return separate_python if separate_python and program in IN_SEPARATE_ENVIRONMENT else sys.executable
 
 
 class _Absent:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-REFERENCES = ("pytorch", "opencv4", "caffe")
+REFERENCES = ("pytorch", "opencv4")
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Row:
 
     ``seconds`` (wall clock) and ``computing`` (CPU time of all threads) are times of a pass, one per round. ``ratios``
     and ``spent`` are their ratios to the references. ``peak`` is the peak memory of the process in MB. ``what`` was
-    timed: "forward", "training" or "program".
+    timed: "forward" or "training".
     """
 
     net: str

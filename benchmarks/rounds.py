@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
@@ -11,9 +10,7 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, Protocol
 
 import numpy as np
@@ -50,21 +47,13 @@ class Contestant(Protocol):
 
 
 class Worker:
-    """A process of benchmarks/worker.py, or of another module like it, with the Python that has its library."""
+    """A process of benchmarks/worker.py, with the Python that has its library."""
 
-    def __init__(
-        self,
-        name: str,
-        python: str,
-        task: Mapping[str, Any],
-        variables: Mapping[str, str | None] | None = None,
-        module: str = "benchmarks.worker",
-    ):
+    def __init__(self, name: str, python: str, task: Mapping[str, Any]):
         self.name = name
-        result = Path(task["folder"]) / f"{name.replace('/', '_')}.npz"
-        command = [python, "-m", module, json.dumps({**task, "result": str(result)})]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), **(variables or {})}
-        environment = {key: value for key, value in environment.items() if value is not None}
+        result = Path(task["folder"]) / f"{name}.npz"
+        command = [python, "-m", "benchmarks.worker", json.dumps({**task, "result": str(result)})]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         self.errors = result.with_suffix(".log").open("w+")
         self.process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, text=True
@@ -107,88 +96,6 @@ def _peak(process: int) -> float | None:
     path = Path(f"/proc/{process}/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", path.read_text()) if path.is_file() else None
     return int(found[1]) / 1e3 * 1.024 if found else None
-
-
-class Command:
-    """A whole process, started again for each pass; the times are those from its start to its end."""
-
-    peak: float | None = None
-
-    def __init__(self, name: str, words: Sequence[str], variables: Mapping[str, str]) -> None:
-        self.name, self.fault, self.outputs = name, "", {}
-        self._words, self._variables = list(words), {**os.environ, "PYTHONPATH": str(ROOT), **variables}
-
-    def turn(self, passes: int) -> list[Pass]:
-        """See :class:`Contestant`."""
-        return [self._run() for _ in range(passes)]
-
-    def _run(self) -> Pass:
-        with TemporaryFile("w+") as errors:
-            began = time.perf_counter()
-            process = subprocess.Popen(self._words, env=self._variables, stdout=errors, stderr=errors)
-            _, status, used = os.wait4(process.pid, 0)
-            seconds = time.perf_counter() - began
-            process.returncode = os.waitstatus_to_exitcode(status)
-            if process.returncode:
-                errors.seek(0)
-                raise SpecError(f"{self.name}: {(errors.read().strip().splitlines() or ['it failed'])[-1]}")
-        return seconds, used.ru_utime + used.ru_stime
-
-    def close(self) -> None:
-        """See :class:`Contestant`."""
-
-
-class CaffeProgram:
-    """The program ``caffe``, started again for each turn; the times are read from its log."""
-
-    name = "caffe"
-    peak: float | None = None
-
-    def __init__(self, binary: str, task: Mapping[str, Any], training: bool) -> None:
-        self.binary, self.task, self.training = binary, task, training
-        self.outputs: dict[str, np.ndarray] = {}
-        self.fault = ""
-        try:
-            self.turn(1)
-        except (OSError, SpecError) as fault:
-            self.fault = str(fault)
-
-    def turn(self, passes: int) -> list[Pass]:
-        """See :class:`Contestant`."""
-        found = self._iterations(passes) if self.training else self._passes(passes)
-        if not found:
-            raise SpecError(f"{self.binary} logs no times that are known here")
-        return [(seconds, math.nan) for seconds in found]
-
-    def _passes(self, count: int) -> list[float]:
-        log = self._log(["time", f"-model={self.task['prototxt']}", "-phase=TEST", f"-iterations={count}"])
-        return [float(text) / 1e3 for text in re.findall(r"Average Forward pass: ([\d.e+-]+) ms", log)]
-
-    def _iterations(self, count: int) -> list[float]:
-        solver = Path(self.task["folder"]) / "caffe_solver.prototxt"
-        limit = f"max_iter: {count + 2}\ndisplay: 1\nsnapshot_after_train: false"
-        solver.write_text(re.sub(r"max_iter: \d+", limit, Path(self.task["solver"]).read_text()))
-        log = self._log(["train", f"-solver={solver}", f"-weights={self.task['caffemodel']}"])
-        stamps = re.findall(r"^I(?:\d{4})?\d{4} (\d\d:\d\d:\d\d\.\d+).*Iteration \d+, lr", log, re.M)
-        moments = [datetime.strptime(text, "%H:%M:%S.%f") for text in stamps[1:]]  # the first does not count
-        return [(b - a).total_seconds() % 86400 for a, b in itertools.pairwise(moments)]
-
-    def _log(self, words: Sequence[str]) -> str:
-        threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        variables = {
-            **dict.fromkeys(threads, str(self.task["threads"])),
-            "GLOG_minloglevel": "0",
-            "GLOG_logtostderr": "1",
-        }
-        done = subprocess.run(
-            [self.binary, *words], env={**os.environ, **variables}, capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            raise SpecError((done.stderr.strip().splitlines() or ["it failed"])[-1])
-        return done.stderr
-
-    def close(self) -> None:
-        """See :class:`Contestant`."""
 
 
 def measure(

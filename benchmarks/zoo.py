@@ -22,27 +22,12 @@ def lenet(n: Any) -> str:
     return _full(n, "ip2", relu(n, "relu1", _full(n, "ip1", top, 500)), 10)
 
 
-def tiny(n: Any) -> str:
-    """Three layers of at most 20 numbers, as in reinforcement learning and tutorials."""
-    top = relu(n, "relu1", _full(n, "ip1", "data", 20))
-    top = add(n, "TanH", "tanh2", _full(n, "ip2", top, 20))
-    return _full(n, "ip3", top, 10)
-
-
 def pnet(n: Any) -> str:
     """Zhang et al. 2016, MTCNN: the first net, on one window; whether it shows a face."""
     top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 10, 3)), 2)
     top = _prelu(n, "prelu2", conv(n, "conv2", top, 16, 3))
     top = _prelu(n, "prelu3", conv(n, "conv3", top, 32, 3))
     return conv(n, "conv4", top, 2, 1)
-
-
-def rnet(n: Any) -> str:
-    """MTCNN's second net, on one window; whether it shows a face."""
-    top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 28, 3)), 3)
-    top = pool(n, "pool2", _prelu(n, "prelu2", conv(n, "conv2", top, 48, 3)), 3)
-    top = _prelu(n, "prelu4", _full(n, "conv4", _prelu(n, "prelu3", conv(n, "conv3", top, 64, 2)), 128))
-    return _full(n, "conv5-1", top, 2)
 
 
 def onet(n: Any) -> str:
@@ -60,60 +45,6 @@ def cifar10_quick(n: Any) -> str:
     for k, width in ((2, 32), (3, 64)):
         top = _average(n, f"pool{k}", relu(n, f"relu{k}", conv(n, f"conv{k}", top, width, 5, pad=2)))
     return _full(n, "ip2", _full(n, "ip1", top, 64), 10)
-
-
-def cifar10_full(n: Any) -> str:
-    """Caffe's full net for CIFAR-10: LRN within channels."""
-    within = {"local_size": 3, "alpha": 5e-5, "beta": 0.75, "norm_region": 1}
-    top = relu(n, "relu1", pool(n, "pool1", conv(n, "conv1", "data", 32, 5, pad=2), 3))
-    top = add(n, "LRN", "norm1", top, lrn_param=within)
-    top = _average(n, "pool2", relu(n, "relu2", conv(n, "conv2", top, 32, 5, pad=2)))
-    top = add(n, "LRN", "norm2", top, lrn_param=within)
-    top = _average(n, "pool3", relu(n, "relu3", conv(n, "conv3", top, 64, 5, pad=2)))
-    return _full(n, "ip1", top, 10)
-
-
-def alexnet(n: Any) -> str:
-    """Krizhevsky et al. 2012: two groups, LRN before pooling."""
-    top = _lrn(n, "norm1", relu(n, "relu1", conv(n, "conv1", "data", 96, 11, stride=4)))
-    top = pool(n, "pool1", top, 3)
-    top = _lrn(n, "norm2", relu(n, "relu2", conv(n, "conv2", top, 256, 5, pad=2, group=2)))
-    top = pool(n, "pool2", top, 3)
-    top = relu(n, "relu3", conv(n, "conv3", top, 384, 3, pad=1))
-    top = relu(n, "relu4", conv(n, "conv4", top, 384, 3, pad=1, group=2))
-    top = relu(n, "relu5", conv(n, "conv5", top, 256, 3, pad=1, group=2))
-    top = pool(n, "pool5", top, 3)
-    for k in (6, 7):
-        top = _dropout(n, f"drop{k}", relu(n, f"relu{k}", _full(n, f"fc{k}", top, 4096)), 0.5)
-    return _full(n, "fc8", top, 1000)
-
-
-def googlenet(n: Any) -> str:
-    """Szegedy et al. 2014, without the side classifiers."""
-    top = relu(n, "conv1_relu", conv(n, "conv1", "data", 64, 7, stride=2, pad=3))
-    top = _lrn(n, "norm1", pool(n, "pool1", top, 3))
-    top = relu(n, "conv2_reduce_relu", conv(n, "conv2_reduce", top, 64, 1))
-    top = _lrn(n, "norm2", relu(n, "conv2_relu", conv(n, "conv2", top, 192, 3, pad=1)))
-    top = pool(n, "pool2", top, 3)
-    for name, *widths in GOOGLENET:
-        top = pool(n, name, top, 3) if not widths else _inception(n, f"inception_{name}", top, widths)
-    top = add(n, "Pooling", "pool5", top, pooling_param={"pool": "AVE", "kernel_size": 7, "stride": 1})
-    return _full(n, "classifier", _dropout(n, "drop5", top, 0.4), 1000)
-
-
-GOOGLENET: tuple[tuple[Any, ...], ...] = (  # 1x1, reduced for 3x3, 3x3, reduced for 5x5, 5x5, after the pooling
-    ("3a", 64, 96, 128, 16, 32, 32),
-    ("3b", 128, 128, 192, 32, 96, 64),
-    ("pool3",),
-    ("4a", 192, 96, 208, 16, 48, 64),
-    ("4b", 160, 112, 224, 24, 64, 64),
-    ("4c", 128, 128, 256, 24, 64, 64),
-    ("4d", 112, 144, 288, 32, 64, 64),
-    ("4e", 256, 160, 320, 32, 128, 128),
-    ("pool4",),
-    ("5a", 256, 160, 320, 32, 128, 128),
-    ("5b", 384, 192, 384, 48, 128, 128),
-)
 
 
 def resnet50(n: Any) -> str:
@@ -190,15 +121,10 @@ def squeezenet(n: Any) -> str:
 SQUEEZENET = ((16, 64), (16, 64), (32, 128), (32, 128), (48, 192), (48, 192), (64, 256), (64, 256))
 
 ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the layers, and the image (C, H, W)
-    "tiny": (tiny, (10, 1, 1)),
     "pnet": (pnet, (3, 12, 12)),
-    "rnet": (rnet, (3, 24, 24)),
     "onet": (onet, (3, 48, 48)),
     "lenet": (lenet, (1, 28, 28)),
     "cifar10_quick": (cifar10_quick, (3, 32, 32)),
-    "cifar10_full": (cifar10_full, (3, 32, 32)),
-    "alexnet": (alexnet, (3, 227, 227)),
-    "googlenet": (googlenet, (3, 224, 224)),
     "resnet50": (resnet50, (3, 224, 224)),
     "mobilenet": (mobilenet, (3, 224, 224)),
     "squeezenet": (squeezenet, (3, 227, 227)),
@@ -265,10 +191,6 @@ def _dropout(n: Any, name: str, bottom: str, ratio: float) -> str:
     return add(n, "Dropout", name, bottom, in_place=True, dropout_param={"dropout_ratio": ratio})
 
 
-def _lrn(n: Any, name: str, bottom: str) -> str:
-    return add(n, "LRN", name, bottom, lrn_param={"local_size": 5, "alpha": 1e-4, "beta": 0.75})
-
-
 def pool(n: Any, name: str, bottom: str, size: int, stride: int = 2, pad: int = 0) -> str:
     """Add a max pooling; return its top."""
     return add(n, "Pooling", name, bottom, pooling_param={"kernel_size": size, "stride": stride, "pad": pad})
@@ -280,15 +202,3 @@ def _average(n: Any, name: str, bottom: str) -> str:
 
 def _sum(n: Any, name: str, *bottoms: str) -> str:
     return add(n, "Eltwise", name, *bottoms)
-
-
-def _inception(n: Any, name: str, bottom: str, widths: list[int]) -> str:
-    one, reduce3, three, reduce5, five, pooled = widths
-    parts = [relu(n, f"{name}_1x1_relu", conv(n, f"{name}_1x1", bottom, one, 1))]
-    top = relu(n, f"{name}_3x3_reduce_relu", conv(n, f"{name}_3x3_reduce", bottom, reduce3, 1))
-    parts.append(relu(n, f"{name}_3x3_relu", conv(n, f"{name}_3x3", top, three, 3, pad=1)))
-    top = relu(n, f"{name}_5x5_reduce_relu", conv(n, f"{name}_5x5_reduce", bottom, reduce5, 1))
-    parts.append(relu(n, f"{name}_5x5_relu", conv(n, f"{name}_5x5", top, five, 5, pad=2)))
-    top = pool(n, f"{name}_pool", bottom, 3, stride=1, pad=1)
-    parts.append(relu(n, f"{name}_pooled_relu", conv(n, f"{name}_pooled", top, pooled, 1)))
-    return add(n, "Concat", f"{name}_output", *parts)
