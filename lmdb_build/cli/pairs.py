@@ -307,7 +307,7 @@ def _shares(text: str) -> tuple[float, ...]:
 def _add_sheet(commands: Commands) -> None:
     parser = commands.add_parser("sheet", _sheet, help="draw sample pairs of a list")
     parser.add_argument("list", type=Path, metavar="LIST", help="a list of pairs")
-    parser.add_argument("picture", type=Path, metavar="PICTURE", help="the image to write, such as sheet.png")
+    parser.add_output("picture", type=Path, metavar="PICTURE", help="the image to write, such as sheet.png")
     parser.add_argument(
         "--root", type=Path, metavar="FOLDER", help="folder of the images (default: the folder in the list's header)"
     )

@@ -48,8 +48,9 @@ def _add_train(commands: Commands) -> None:
     parser.add_output(
         "--scores", metavar="F.json", help="write the scores of each test and the names of the snapshots to this file"
     )
-    parser.add_argument(
+    parser.add_output(
         "--tensorboard",
+        folder=True,
         metavar="DIR",
         help="write losses, learning rates and test outputs to this folder, for TensorBoard",
     )

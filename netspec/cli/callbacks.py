@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from tqdm import tqdm
 from typing_extensions import override
 
 from netspec.cli.scores import Score, Scores, Snapshot, read_scores
-from netspec.errors import SpecError, Where
+from netspec.errors import SpecError
 from netspec.solver.solver import Solver
 from netspec.solver.training import Callback
 
@@ -90,14 +89,10 @@ def writer_class() -> Any:
 def board(solver: Solver, folder: str | Path) -> Iterator[Board]:
     """Yield what writes a training into a folder for TensorBoard.
 
-    A resumed training continues in its folder; results of later iterations in it are hidden. Raises
-    SpecError if the package is missing or the folder cannot be written.
+    A resumed training continues in its folder; results of later iterations in it are hidden. Raises SpecError if the
+    package is missing.
     """
-    try:
-        os.makedirs(folder, exist_ok=True)
-        writer = writer_class()(str(folder), purge_step=solver.iteration or None)
-    except OSError as fault:
-        raise SpecError(f"cannot be written: {fault.strerror}", Where(str(folder))) from None
+    writer = writer_class()(str(folder), purge_step=solver.iteration or None)
     try:
         yield Board(solver, writer)
     finally:

@@ -242,6 +242,12 @@ def _variants() -> dict[str, Case]:
     flat, tie = np.ones((2, 4, 3, 3)), given("x", 2, 4) + given("z", 2, 4)
     maps = given("x", 2, 4, 3, 3)
     found |= {
+        "BatchNorm of one axis": _case("BatchNorm", given("x", 4) + layer("BatchNorm", "x", "y")),
+        "Convolution of no spatial axis": _case(
+            "Convolution",
+            given("x", 2, 4) + layer("Convolution", "x", "y", "convolution_param { num_output: 3 kernel_size: 1 }"),
+        ),
+        "ArgMax of one axis": _case("ArgMax", given("x", 4) + layer("ArgMax", "x", "y")),
         "BatchNorm of six axes": _case("BatchNorm", given("x", 2, 2, 1, 2, 1, 2) + layer("BatchNorm", "x", "y")),
         "BatchNorm of one value": _case("BatchNorm", given("x", 1, 4) + layer("BatchNorm", "x", "y")),
         "BatchNorm of nearly equal values": _case(

@@ -5,6 +5,7 @@ The result is a NetParameter with its weights, for Caffe or any reader of its fi
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -106,11 +107,12 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
     """Return the names of the remaining values.
 
     An output of a layer that is removed keeps its name: the value that the layer copies gets this name. If other layers
-    read that value too, it keeps its own name, and the layer that copies it stays.
+    read that value too, or if it has several such names, it keeps its own name, and the layers that copy it stay.
     """
     plan = net.plan
     names = {v: blob for v, blob in enumerate(plan.blobs) if origin[v] == v}
-    taken = {v for v in plan.outputs.values() if origin[v] == v}
+    taken = {v for v, count in Counter(origin[v] for v in plan.outputs.values()).items() if count > 1}
+    taken.update(v for v in plan.outputs.values() if origin[v] == v)
     taken.update(
         origin[v]
         for node, layer in zip(plan.nodes, net.layers, strict=True)
@@ -123,7 +125,6 @@ def _names(net: Net, origin: tuple[int, ...]) -> dict[int, str]:
             names[v] = name
         elif origin[v] != v:
             names[origin[v]] = name
-            taken.add(origin[v])
     return names
 
 

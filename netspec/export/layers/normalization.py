@@ -31,9 +31,9 @@ def batch_norm(layer: Any, code: TorchCode, x: Expression) -> Expression:
 def is_module(layer: Any) -> bool:
     """Return whether the normalization by stored statistics is a module of torch.
 
-    It is none for so many axes, and none of a training net: in training, it would take the statistics of batches.
+    It is none for one axis or six, and none of a training net: in training, it would take the statistics of batches.
     """
-    return layer.phase == TEST and len(layer.bottom_shapes[0]) <= 5
+    return layer.phase == TEST and 2 <= len(layer.bottom_shapes[0]) <= 5
 
 
 def by_statistics(
@@ -42,7 +42,9 @@ def by_statistics(
     """Return the normalization by stored statistics; ``affine`` has a module's weight and bias, or is empty."""
     eps = rounded(layer.eps)
     if not is_module(layer):
-        return call(F.batch_norm, x, code.buffer(mean), code.buffer(variance), eps=eps)
+        only = len(layer.bottom_shapes[0]) == 1
+        y = call(F.batch_norm, x[:, None] if only else x, code.buffer(mean), code.buffer(variance), eps=eps)
+        return y[:, 0] if only else y
     count = torch.zeros((), dtype=torch.long)
     state = {**affine, "running_mean": mean, "running_var": variance, "num_batches_tracked": count}
     options = {**({} if eps == 1e-5 else {"eps": eps}), **({} if affine else {"affine": False})}

@@ -53,8 +53,8 @@ def reduction(layer: Any, code: TorchCode, x: Expression) -> Expression:
 @exports(ArgMax)
 def argmax(layer: Any, code: TorchCode, x: Expression) -> Expression:
     p = layer.param.argmax_param
-    if layer.axis is None and len(layer.bottom_shapes[0]) > 2:
-        x = x.flatten(1)
+    if layer.axis is None and (axes := len(layer.bottom_shapes[0])) != 2:
+        x = x.flatten(1) if axes > 2 else x[:, None]
     found = call(arg_max, x, dim=1 if layer.axis is None else layer.axis, top_k=p.top_k)
     if layer.axis is not None:
         return found[1 if p.out_max_val else 0]

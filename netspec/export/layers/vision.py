@@ -85,7 +85,8 @@ def convolved(
         state["bias"] = layer.blob(1)
     else:
         options["bias"] = False
-    module = code.module(classes[layer.spatial_axes - 1], layer.channels, layer.num_output, state=state, **options)
+    cls = classes[max(layer.spatial_axes - 1, 0)]
+    module = code.module(cls, layer.channels, layer.num_output, state=state, **options)
     return [_filtered(layer, code, bottom, module) for bottom in bottoms]
 
 

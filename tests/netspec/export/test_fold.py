@@ -99,6 +99,14 @@ def test_dropout_and_split_are_removed_and_outputs_keep_their_names(net_of: Call
     assert_same(here(again, random_inputs(net)), here(net, random_inputs(net)))
 
 
+def test_all_outputs_of_a_split_stay(net_of: Callable[..., Net], tmp_path: Path) -> None:
+    net = net_of(f"""{INPUT} layer {{ name: "relu" type: "ReLU" bottom: "data" top: "a" }}
+    layer {{ name: "copies" type: "Split" bottom: "a" top: "b" top: "c" }}""")
+    small = folded(net, tmp_path)
+    assert small.outputs == net.outputs == ["b", "c"]
+    assert_same(here(small, random_inputs(net)), here(net, random_inputs(net)))
+
+
 SHARED = 'param { name: "m" lr_mult: 0 } param { name: "v" lr_mult: 0 } param { name: "n" lr_mult: 0 }'
 
 

@@ -53,7 +53,7 @@ def test_a_resumed_training_replaces_repeated_iterations(run: Run, solver: Calla
 
 def test_faults(run: Run, solver: Callable[[int], str], monkeypatch: pytest.MonkeyPatch) -> None:
     Path("file").write_text("")
-    assert run("train", solver(1), "--tensorboard", "file").fault == "file: cannot be written: File exists"
+    assert run("train", solver(1), "--tensorboard", "file").fault == "file: cannot be written: Not a directory"
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     result = run("train", solver(1), "--tensorboard", "board")
     assert result.fault == "--tensorboard needs an extra package: pip install 'netspec-caffe[tensorboard]'"
