@@ -21,7 +21,6 @@ from exported import (
     trained,
 )
 from netspec import use_dialect
-from netspec.errors import SpecError
 from netspec.export.formats.shapes import find_shapes
 from netspec.net.net import Net
 
@@ -61,34 +60,6 @@ def test_exported_layer_computes_the_same(case: dict[str, str], net_of: Callable
             assert_same(in_opencv(model, given), expected, scalars_have_an_axis=True)
 
 
-def test_upsample_puts_maxima_back_to_their_pixels(net_of: Callable[..., Net]) -> None:
-    use_dialect("blocks")
-    text = """layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 dim: 8 dim: 6 } } }
-    layer { name: "pool" type: "Pooling" bottom: "x" top: "pool" top: "mask"
-      pooling_param { kernel_size: 2 stride: 2 } }
-    layer { name: "up" type: "Upsample" bottom: "pool" bottom: "mask" top: "up" upsample_param { scale: 2 } }"""
-    net = net_of(text)
-    inputs = random_inputs(net)
-    model, notes = onnx_model(net)
-    assert [line.split(" is fixed")[0] for line in notes] == ["the height", "the width"]
-    expected = here(net, inputs)
-    assert_same(in_onnxruntime(model, inputs), expected)
-    assert_same(run_module(source_module(net), net, inputs), expected)
-    if OPENCV_5:
-        assert_same(in_opencv(model, inputs), expected)
-
-
-def test_roi_pooling_computes_the_same_in_onnxruntime_and_is_refused_for_pytorch(net_of: Callable[..., Net]) -> None:
-    use_dialect("rcnn")
-    layer = "type: 'ROIPooling' roi_pooling_param { pooled_h: 3 pooled_w: 2 spatial_scale: 0.5 }"
-    net = net_of(net_text(layer, {"x": (2, 4, 9, 8), "rois": (4, 5)}))
-    corners = np.array([[0, 1, 1, 9, 13], [1, 2, 2, 12, 8], [1, 0, 0, 15, 17], [0, 3, 3, 4, 4]], np.float32)
-    inputs = {"x": random_inputs(net)["x"], "rois": corners}
-    assert_same(in_onnxruntime(onnx_model(net)[0], inputs), here(net, inputs))
-    with pytest.raises(SpecError, match=r"\(ROIPooling\): cannot be exported: .*pooling of regions"):
-        source_module(net)
-
-
 def detections(
     net_of: Callable[..., Net], settings: str, images: int, priors: int, kinds: int
 ) -> tuple[Net, dict[str, np.ndarray]]:
@@ -113,14 +84,10 @@ def detections(
 DETECTIONS = {
     "as SSD": "nms_param { nms_threshold: 0.45 top_k: 30 } keep_top_k: 20 confidence_threshold: 0.1 "
     "code_type: CENTER_SIZE",
-    "everything": "nms_param { nms_threshold: 0.5 } code_type: CENTER_SIZE",
     "most": "nms_param { nms_threshold: 0.5 } code_type: CENTER_SIZE confidence_threshold: 0.01",
-    "few": "nms_param { nms_threshold: 0.3 top_k: 5 } keep_top_k: 3 code_type: CENTER_SIZE background_label_id: 2",
     "all classes": "nms_param { nms_threshold: 0.3 } keep_top_k: 9 code_type: CENTER_SIZE background_label_id: -1",
     "nothing": "nms_param { nms_threshold: 0.3 } confidence_threshold: 2 keep_top_k: 5 code_type: CENTER_SIZE",
-    "encoded": "nms_param { nms_threshold: 0.3 } variance_encoded_in_target: true code_type: CENTER_SIZE",
     "corners": "nms_param { nms_threshold: 0.4 } code_type: CORNER confidence_threshold: 0.2",
-    "corners and size": "nms_param { nms_threshold: 0.4 } code_type: CORNER_SIZE keep_top_k: 12",
     "own boxes": "share_location: false nms_param { nms_threshold: 0.4 top_k: 20 } keep_top_k: 12 "
     "code_type: CENTER_SIZE confidence_threshold: 0.05",
 }
@@ -140,9 +107,3 @@ def test_detection_output_computes_the_same(name: str, net_of: Callable[..., Net
         if OPENCV_5 and "confidence_threshold" in settings:  # its suppression takes no threshold below 0
             assert_same(in_opencv(model, given), expected)
         assert_same(run_module(module, net, given), expected)
-
-
-def test_an_adaptive_nms_threshold_is_refused(net_of: Callable[..., Net]) -> None:
-    net, _ = detections(net_of, "nms_param { nms_threshold: 0.6 eta: 0.9 }", 1, 4, 1)
-    with pytest.raises(SpecError, match=r"cannot be exported: .*eta must be 1"):
-        onnx_model(net)

@@ -264,47 +264,6 @@ def test_layers_without_gradients_are_skipped(net_of: Callable[..., caffe.Net]) 
     assert not net.params["conv1"][0].diff.any()
 
 
-def test_guided_backpropagation(net_of: Callable[..., caffe.Net]) -> None:
-    """Layer by layer, negative gradients cut off at each ReLU."""
-    text = INPUT + "".join(
-        f'layer {{ name: "c{i}" type: "Convolution" bottom: "{bottom}" top: "c{i}" convolution_param {{ num_output: 4 '
-        f'kernel_size: 3 weight_filler {{ type: "xavier" }} }} }} '
-        f'layer {{ name: "r{i}" type: "ReLU" bottom: "c{i}" top: "c{i}" }}'
-        for i, bottom in enumerate(("data", "c0"))
-    )
-    net = net_of(text)
-    net.forward(data=image(1, 3, 12, 12))
-    plain = {}
-    net.blobs["c1"].diff[...] = image(1, 4, 8, 8)
-    net.backward(start="c1", end="c0")
-    plain["data"] = net.blobs["data"].diff.copy()
-    net.blobs["c1"].diff[...] = np.maximum(image(1, 4, 8, 8), 0)
-    net.backward(start="r1", end="r1")
-    masked = net.blobs["c1"].diff.copy()
-    assert (masked[net.blobs["c1"].data == 0] == 0).all()
-    net.backward(start="c1", end="c1")
-    np.maximum(net.blobs["c0"].diff, 0, out=net.blobs["c0"].diff)
-    guided = net.backward(start="r0", end="c0")["data"]
-    assert guided.any()
-    assert not np.allclose(guided, plain["data"])
-
-
-def test_deep_dream_increases_its_objective(net_of: Callable[..., caffe.Net]) -> None:
-    net = net_of(PYRAMID)
-    source, target = net.blobs["data"], net.blobs["pool1"]
-    source.reshape(1, 3, 24, 24)
-    source.data[0] = image(3, 24, 24)
-    norms = []
-    for _ in range(10):
-        net.forward(end="pool1")
-        norms.append(float((target.data**2).sum()))
-        target.diff[:] = target.data
-        net.backward(start="pool1")
-        gradient = source.diff[0]
-        source.data[:] += 0.5 / np.abs(gradient).mean() * gradient * 0.1
-    assert norms == sorted(norms)
-
-
 FROM_X = """
 force_backward: true
 layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 4 dim: 3 dim: 2 dim: 2 } } }

@@ -194,30 +194,6 @@ def test_dropout_of_the_test_phase_copies(net_of: Callable[..., caffe.Net]) -> N
     assert np.array_equal(net.blobs["drop"].data, before)
 
 
-def test_net_surgery(net_of: Callable[..., caffe.Net], write: Callable[..., str]) -> None:
-    """The weights of an InnerProduct, copied to a Convolution, give the same scores at each position."""
-    dense = net_of(
-        INPUT + 'layer { name: "fc" type: "InnerProduct" bottom: "data" top: "fc" inner_product_param '
-        '{ num_output: 5 weight_filler { type: "xavier" } bias_filler { type: "uniform" } } }'
-    )
-    write(
-        INPUT + 'layer { name: "fc-conv" type: "Convolution" bottom: "data" top: "fc-conv" convolution_param '
-        "{ num_output: 5 kernel_size: 12 } }",
-        "conv.prototxt",
-    )
-    conv = caffe.Net("conv.prototxt", caffe.TEST)
-    conv.params["fc-conv"][0].data.flat = dense.params["fc"][0].data.flat  # pyright: ignore[reportAttributeAccessIssue]
-    conv.params["fc-conv"][1].data[...] = dense.params["fc"][1].data
-    data = image(1, 3, 12, 12)
-    expected = dense.forward(data=data)["fc"]
-    np.testing.assert_allclose(conv.forward(data=data)["fc-conv"][..., 0, 0], expected, rtol=1e-4, atol=1e-5)
-    conv.blobs["data"].reshape(1, 3, 20, 20)
-    assert conv.forward(data=image(1, 3, 20, 20))["fc-conv"].shape == (1, 5, 9, 9)
-    conv.save("surgery.caffemodel")
-    again = caffe.Net("conv.prototxt", caffe.TEST, weights="surgery.caffemodel")
-    assert np.array_equal(again.params["fc-conv"][0].data, conv.params["fc-conv"][0].data)
-
-
 @pytest.mark.parametrize(
     ("assignment", "kind"),
     [

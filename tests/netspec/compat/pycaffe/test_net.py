@@ -126,21 +126,6 @@ def test_levels(write: Callable[..., str], level: int | None, expected: list[str
         assert blobs_made(caffe.Net(path, caffe.TEST, level)) == expected
 
 
-@pytest.mark.parametrize(
-    ("stages", "expected"),
-    [(None, ["always"]), (["B"], ["always", "B"]), (["A", "B"], ["always", "A", "B", "A and B"]), (["C"], ["always"])],
-)
-def test_stages(write: Callable[..., str], stages: list[str] | None, expected: list[str]) -> None:
-    path = write(
-        'input: "data" input_shape { dim: 1 dim: 1 dim: 10 dim: 10 }'
-        + ruled("always", "")
-        + ruled("A", 'include { stage: "A" }')
-        + ruled("B", 'include { stage: "B" }')
-        + ruled("A and B", 'include { stage: "A" stage: "B" }')
-    )
-    assert blobs_made(caffe.Net(path, caffe.TEST, stages=stages)) == expected
-
-
 def test_train_test_and_deploy_in_one_file(write: Callable[..., str]) -> None:
     shape = "shape { dim: 1 dim: 1 dim: 10 dim: 10 }"
     data = f'type: "DummyData" top: "data" top: "label" dummy_data_param {{ {shape} shape {{ dim: 1 dim: 1 }} }}'

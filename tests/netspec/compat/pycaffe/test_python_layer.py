@@ -103,18 +103,6 @@ def test_phase(python_net: Callable[..., caffe.Net]) -> None:
         assert str(net.layers[0].phase) == ("TRAIN", "TEST")[phase]  # as py-faster-rcnn asks for
 
 
-def test_param_str(python_net: Callable[..., caffe.Net]) -> None:
-    text = 'force_backward: true input: "data" input_shape { dim: 10 dim: 9 dim: 8 }\n'
-    text += layer("Scaled", "ten", "data", 'param_str: "10"') + layer("Scaled", "two", "ten", 'param_str: "2"')
-    net = python_net(text, caffe.TRAIN)
-    net.blobs["data"].data[...] = 8
-    net.forward()
-    assert (net.blobs["two"].data == 160).all()
-    net.blobs["two"].diff[...] = 7
-    net.backward()
-    assert (net.blobs["data"].diff == 140).all()
-
-
 def test_scripts_can_access_the_python_object_of_a_layer(python_net: Callable[..., Any]) -> None:
     text = 'layer { type: "Python" name: "rows" top: "row" top: "label" python_param { module: "mine" layer: "Rows" } }'
     net = python_net(text)
