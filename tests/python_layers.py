@@ -121,17 +121,6 @@ class NoLayer(object):
         pass
 
 
-class Scaled(TimesTen):
-    def setup(self, bottom, top):
-        self.factor = float(self.param_str)
-
-    def forward(self, bottom, top):
-        top[0].data[...] = self.factor * bottom[0].data
-
-    def backward(self, top, propagate_down, bottom):
-        bottom[0].diff[...] = self.factor * top[0].diff
-
-
 class Broken(caffe.Layer):
     def setup(self, bottom, top):
         raise RuntimeError("setup of a broken layer")

@@ -94,17 +94,6 @@ def test_the_wheel_has_its_metadata(wheel: Path) -> None:
     }
 
 
-def test_from_a_walk_to_an_lmdb_and_its_mean(commands: Path, tmp_path: Path) -> None:
-    lmdb_build = commands / "lmdb-build"
-    run(lmdb_build, "walk", "w", "--frames", "60", "--size", "48x36", "--laps", "2", cwd=tmp_path)
-    pairs = ("--train", "20", "--val", "0", "--test", "0", "--out", "pairs")
-    run(lmdb_build, "pairs", "w/walk_1", *pairs, cwd=tmp_path)
-    run(lmdb_build, "convert", "-gray", "-shuffle", "w/", "pairs/train.txt", "train_lmdb", cwd=tmp_path)
-    done = run(lmdb_build, "mean", "train_lmdb", "mean.binaryproto", cwd=tmp_path)
-    assert "Number of channels: 2" in done.stderr
-    assert (tmp_path / "mean.binaryproto").is_file()
-
-
 def test_the_other_commands_run_without_the_source(commands: Path, tmp_path: Path) -> None:
     net = GOLDEN / "snapshot" / "train_val.prototxt"
     table = run(commands / "netspec", "check", net, "--shape", "pair_data=4,2,28,28", cwd=tmp_path).stdout

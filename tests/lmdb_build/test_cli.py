@@ -1,15 +1,12 @@
 """The command lmdb-build: from a walk to lists and a picture, and what it says to wrong input."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from lmdb_build.cli import main
 from lmdb_build.pairs.list_file import read_pair_list, read_settings
-from paths import ROOT
 from places_layouts import path, tum_rows, write_benchmark, write_euroc, write_kitti, write_video
 
 
@@ -60,11 +57,6 @@ def test_printed_commands_work_with_convert(walks: Path, tmp_path: Path, capsys:
     assert (out / "mean.binaryproto").stat().st_size > 1000
 
 
-def test_two_houses_are_two_scenes(walks: Path) -> None:
-    first, second = (next((walks / name / "rgb").iterdir()).read_bytes() for name in ("walk_1", "walk_2"))
-    assert first != second
-
-
 def test_a_warning_for_undeclared_scenes(walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(pairs(walks, "--out", str(tmp_path), "--train", "60", "--val", "0")) == 0
     assert "warning: train: " in capsys.readouterr().err
@@ -99,18 +91,6 @@ def test_an_error_of_the_user_is_one_line_with_status_1(
     assert said.count("\n") == 1
 
 
-def test_an_invalid_line_of_groundtruth_is_reported(
-    walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "s/rgb").mkdir(parents=True)
-    (tmp_path / "s/rgb/1.png").touch()
-    (tmp_path / "s/rgb.txt").write_text("1.0 rgb/1.png\n")
-    (tmp_path / "s/groundtruth.txt").write_text("# head\n1.0 0 0 0 0 0 0 one\n")
-    assert main(["pairs", str(tmp_path / "s"), "--out", str(tmp_path)]) == 1
-    place = tmp_path / "s/groundtruth.txt"
-    assert capsys.readouterr().err.startswith(f'{place}:2:1: expected a number, found "one"')
-
-
 @pytest.mark.parametrize(
     "line",
     [
@@ -132,15 +112,6 @@ def test_wrong_usage_is_status_2(line: str, tmp_path: Path, monkeypatch: pytest.
     monkeypatch.chdir(tmp_path)
     assert main(line.split()) == 2
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_python_m_lmdb_build() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "lmdb_build", "--help"], capture_output=True, text=True, check=False, cwd=ROOT
-    )
-    assert done.returncode == 0
-    assert "walk" in done.stdout
 
 
 def lists(out: Path, line: str) -> list[tuple[str, str, int]]:

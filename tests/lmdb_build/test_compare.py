@@ -156,14 +156,6 @@ def test_a_training_resumes(edited: Callable[..., None]) -> None:
     assert {**row("out"), "ms/image": ""} == {**before, "ms/image": ""}
 
 
-def test_without_training_existing_snapshots_are_scored(folder: Path) -> None:
-    for iteration, name in ((40, "ref_iter_40"), (60, "straight_iter_60")):
-        model = (GOLDEN / "snapshot" / f"{name}.caffemodel").read_bytes()
-        (folder / "sgd_step" / f"ref_iter_{iteration}.caffemodel").write_bytes(model)
-    assert main(["compare", SOLVER, "--no-train"]) == 0
-    assert row("out/compare")["iteration"] in ("40", "60")
-
-
 def test_the_best_snapshot() -> None:
     assert best_snapshot([5, 10, 15], {0: 0.1, 5: 0.3, 10: 0.2, 15: 0.2}) == 10
     assert best_snapshot([5, 10], {5: float("nan"), 10: 3.0}) == 10

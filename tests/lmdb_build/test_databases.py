@@ -62,7 +62,6 @@ def pair_list(tmp_path: Path) -> str:
 # Single images: the same bytes as Caffe's convert_imageset
 
 
-@pytest.mark.parametrize("workers", ["-workers=1", "-workers=2"])
 @pytest.mark.parametrize(
     ("flags", "database"),
     [
@@ -72,10 +71,8 @@ def pair_list(tmp_path: Path) -> str:
         (["-encoded"], "lmdb_encoded"),
     ],
 )
-def test_records_of_single_images_are_byte_identical_to_caffes(
-    tmp_path: Path, flags: list[str], database: str, workers: str
-) -> None:
-    assert convert_imageset([workers, *flags, PNG, str(GOLDEN / "list.txt"), str(tmp_path / "db")]) == 0
+def test_records_of_single_images_are_byte_identical_to_caffes(tmp_path: Path, flags: list[str], database: str) -> None:
+    assert convert_imageset(["-workers=2", *flags, PNG, str(GOLDEN / "list.txt"), str(tmp_path / "db")]) == 0
     assert records(tmp_path / "db") == records(GOLDEN / database)
 
 
@@ -210,9 +207,6 @@ def test_a_missing_image_is_reported_with_its_line(
         ("0.png 0 1", ["-encoded"], 'l:1:1: image "{root}/0" has no extension that gives its format; set -encode_type'),
         ("0.png 0.png 1", ["-encode_type=abc"], 'cannot be encoded as "abc"'),
         ("0.png 1.png", [], "l:1:1: found '0.png 1.png', expected two images and a label"),
-        ("0.png 1.png 2", [], "a label is 1 (same place) or 0 (other places)"),
-        ("a b.png c.png 1", [], "names with blanks go into double quotes"),
-        ("# none", [], "lists no pair"),
     ],
 )
 def test_images_that_cannot_be_converted_are_refused(

@@ -5,19 +5,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import scipy.io
 
 from lmdb_build.pairs.by_list import MaskSource, PlaceSource, folders_source
 from lmdb_build.pairs.choose import (
     LEFT_OUT,
     NEGATIVE,
     POSITIVE,
-    choose_pairs,
     split_by_group,
     split_by_time,
 )
 from loopclosure.errors import InputError
-from paths import shared
 
 
 def images(folder: Path, *names: str) -> Path:
@@ -90,21 +87,6 @@ class TestMask:
         images(run / "run", "13.png")
         with pytest.raises(InputError, match=r"mask\.png: is 12 x 12, but there are 13 images"):
             MaskSource(run / "mask.png", run / "run", run)
-
-    def test_a_mask_of_matlab(self, run: Path) -> None:
-        truth = np.zeros((12, 12), np.uint8)
-        truth[9, 1] = 1
-        scipy.io.savemat(run / "truth.mat", {"truth": truth})
-        source = MaskSource(run / "truth.mat", run / "run", run)
-        assert label(source, "run/2.png", "run/10.png") == POSITIVE
-
-    def test_corridor_loop(self) -> None:
-        folder = shared("data", "corridor_loop")
-        source = MaskSource(folder / "samples_GT.bmp", folder / "samples", folder)
-        assert len(source.names) == 84
-        assert len(source.positives()) == 228
-        chosen = choose_pairs(source, np.arange(84), 400, np.random.default_rng(1), "train")
-        assert chosen.labels.sum() == 200
 
 
 class TestFolders:

@@ -52,16 +52,13 @@ def as_sets(pairs: np.ndarray) -> set[tuple[int, int]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["time", "group"])
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("lengths", [(120, 90, 110), (61, 200, 40, 77)])
-def test_lists_are_balanced_disjoint_and_labeled_by_the_rule(
-    tmp_path: Path, by: str, seed: int, lengths: tuple[int, ...]
-) -> None:
+def test_lists_are_balanced_disjoint_and_labeled_by_the_rule(tmp_path: Path, by: str, lengths: tuple[int, ...]) -> None:
     rule = PoseRule(min_gap_s=0.25)
     source = pose_source(lengths, rule)
     index = {name: number for number, name in enumerate(source.names)}
     counts = {"train": 120, "val": 40, "test": 30}
-    lists = build(source, Plan(counts, seed=seed, by=by), tmp_path / "lists")
+    lists = build(source, Plan(counts, seed=1, by=by), tmp_path / "lists")
     images: dict[str, set[str]] = {}
     for split, path in lists.items():
         listed = read_pair_list(path)

@@ -175,8 +175,3 @@ def test_the_path_visits_every_room_and_avoids_boxes(rooms: int) -> None:
 def test_invalid_settings_of_a_walk_are_refused(tmp_path: Path, change: dict[str, int], words: str) -> None:
     with pytest.raises(InputError, match=words):
         list(write_walk(tmp_path / "w", replace(SMALL, **change)))
-
-
-def test_a_folder_with_a_sequence_is_not_overwritten(folder: Path) -> None:
-    with pytest.raises(InputError, match="holds a sequence already"):
-        list(write_walk(folder, SMALL))

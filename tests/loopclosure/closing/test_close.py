@@ -21,7 +21,6 @@ from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.same_place import same_place_matrix
 from loopclosure.places.sequences import read_sequence
-from paths import shared
 
 pytestmark = pytest.mark.slow
 
@@ -172,16 +171,6 @@ def test_without_a_camera_its_parameters_are_required(two_laps: Path, tmp_path: 
     line = f"close {two_laps} --loops {tmp_path / 'loops.csv'} --drift 1 --out {tmp_path / 'out'}"
     assert main(line.split()) == 1
     assert "has no camera calibration; give --camera FX,FY,CX,CY" in capsys.readouterr().err
-
-
-def test_fr1_rpy_where_the_camera_turns_gets_rotations_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From color alone, with TUM's camera parameters for images of half the size."""
-    folder = shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy")
-    (tmp_path / "loops.csv").write_text("query_id,match_id\n" + "".join(f"{i},{i - 90}\n" for i in range(120, 720, 40)))
-    camera = "258.65,258.25,159.05,127.4,0.2624,-0.9531,-0.0054,0.0026,1.1633"
-    line = f"close {folder} --loops {tmp_path / 'loops.csv'} --drift 2 --camera {camera} --out {tmp_path / 'out'}"
-    assert main(line.split()) == 0
-    assert re.search(r"\d+ loops give a rotation only", capsys.readouterr().out)
 
 
 def test_every_third_frame(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

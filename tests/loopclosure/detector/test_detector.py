@@ -207,30 +207,6 @@ def test_other_files_than_detectors_are_refused(tmp_path):
         LoopDetector(None, check=None).save(tmp_path / "no" / "folder.npz")
 
 
-@pytest.mark.slow
-def test_memory_grows_by_doubling():
-    detector = LoopDetector(None, check=None, exclude_recent=0)
-    arrays = set()
-    for row in np.random.default_rng(0).normal(size=(4 * FIRST_CAPACITY, 3)):
-        detector.add_descriptor(row)
-        arrays.add(id(detector._frames.stamps))
-    assert len(detector._frames.stamps) == 4 * FIRST_CAPACITY
-    assert len(arrays) <= 3
-
-
-def test_describe_is_called_with_the_image():
-    seen = []
-
-    def describe(image):
-        seen.append(image.shape)
-        return image.mean(axis=(0, 1))
-
-    detector = LoopDetector(describe, exclude_recent=0, threshold=-1.0, check=None)
-    assert newest(detector.add, np.full((4, 5, 3), 7, np.uint8)).match is None
-    assert newest(detector.add, np.full((4, 5, 3), 7, np.uint8)).match == 0
-    assert seen == [(4, 5, 3)] * 2
-
-
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
@@ -279,13 +255,6 @@ def test_a_file_of_a_detector_names_no_program_to_run(tmp_path):
 def test_a_misspelled_setting_is_a_type_error():
     with pytest.raises(TypeError, match="treshold"):
         LoopDetector(None, check=None, treshold=1.0)
-
-
-def test_a_result_is_true_only_if_a_loop_was_accepted():
-    detector = LoopDetector(None, exclude_recent=0, threshold=-0.1, check=None)
-    results = [newest(detector.add_descriptor, row) for row in ([0.0, 1.0], [1.0, 0.0], [0.0, 1.0])]
-    assert [bool(result) for result in results] == [False, False, True]
-    assert results[1].candidates  # not accepted
 
 
 LAP = np.random.default_rng(0).normal(size=(40, 16)).astype(np.float32)

@@ -12,7 +12,6 @@ from loopclosure.methods.baselines import BagOfWordsMethod, FabMapMethod, Thumbn
 from loopclosure.methods.named import make_method
 from loopclosure.progress import silent
 from loopclosure.words.word_model import WordModel
-from paths import shared
 
 pytestmark = pytest.mark.slow
 
@@ -153,22 +152,3 @@ def test_invalid_methods_and_settings_are_refused(spec: str, settings: str, mess
     name, (key, _, value) = spec.partition("+")[0], settings.partition("=")
     with pytest.raises(InputError, match=message):
         make_method(spec, settings={f"{name}.{key}": value} if settings else {})
-
-
-@pytest.mark.slow
-def test_corridor_loop_with_its_two_images_without_features() -> None:
-    corridor = shared("data", "corridor_loop", "samples")
-    train = sorted(shared("data", "tum_fr1", "rgbd_dataset_freiburg1_rpy", "rgb").glob("*.jpg"))[::12]
-    walk = [corridor / f"{k}.jpg" for k in range(1, 85)]
-    result = make_method(
-        "fabmap", MethodContext(exclude_frames=10), {"fabmap.words": "300", "fabmap.max_features": "150"}
-    ).score(Images.of_files(walk, None, train), silent)
-    assert "2 of 84 images have no features: places without words" in result.notes
-    assert np.isfinite(result.scores[np.tril_indices(84, -11)]).all()
-    mask = cv2.imread(str(corridor.parent / "samples_GT.bmp"), cv2.IMREAD_GRAYSCALE)
-    assert mask is not None
-    truth = mask > 0
-    allowed = np.tri(84, 84, -11, dtype=bool)
-    loops = np.flatnonzero((truth & allowed).any(axis=1))
-    best = np.argmax(np.where(allowed, result.scores, -np.inf), axis=1)
-    assert truth[loops, best[loops]].mean() > 0.6

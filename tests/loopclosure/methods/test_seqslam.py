@@ -95,14 +95,6 @@ def test_contrast_normalizes_a_query_that_differs_from_all_places() -> None:
     assert enhanced[7].mean() == pytest.approx(enhanced[6].mean(), abs=0.5)
 
 
-def test_costs_are_means_along_a_trajectory() -> None:
-    distances = np.random.default_rng(1).random((9, 9))
-    settings = SequenceSettings(length=4, slowest=1.0, fastest=1.0, edges="drop")
-    costs = trajectory_costs(distances, settings)
-    assert costs[4, 3] == pytest.approx(np.mean([distances[4 + k, 3 + k] for k in range(-2, 3)]))
-    np.testing.assert_array_equal(np.isfinite(costs), np.pad(np.ones((5, 5), bool), 2))
-
-
 def test_shared_parts_of_trajectories_keep_the_means() -> None:
     random = np.random.default_rng(3)
     distances = np.where(random.random((150, 600)) < 0.02, np.nan, random.random((150, 600)))
@@ -115,14 +107,6 @@ def test_shared_parts_of_trajectories_keep_the_means() -> None:
     costs = trajectory_costs(distances, settings)
     np.testing.assert_allclose(np.where(np.isnan(costs), np.inf, costs), expected, rtol=1e-12)
     np.testing.assert_array_equal(trajectory_costs(distances, settings, range(70, 140)), costs[70:140])
-
-
-def test_short_trajectories_at_the_edges() -> None:
-    distances = np.random.default_rng(1).random((9, 9))
-    costs = trajectory_costs(distances, SequenceSettings(length=4, slowest=1.0, fastest=1.0))
-    assert costs[0, 0] == pytest.approx(np.mean([distances[k, k] for k in range(3)]))
-    assert costs[1, 5] == pytest.approx(np.mean([distances[1 + k, 5 + k] for k in range(-1, 3)]))
-    assert np.isnan(costs[0, 8])  # only one of five steps lies inside
 
 
 @pytest.mark.parametrize("velocity", [0.8, 1.0, 1.2])

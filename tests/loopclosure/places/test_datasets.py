@@ -226,20 +226,3 @@ def test_new_college_mask():
     assert int((rows - columns).min()) == 142
     assert int(hard[::2, ::2].sum()) == 3541
     assert int(hard[1::2, 1::2].sum()) == 3543
-
-
-def test_corridor_loop():
-    folder = shared("data/corridor_loop")
-    data = load_folder(folder / "samples", folder / "samples_GT.bmp")
-    assert len(data.queries.paths) == 84
-    assert data.queries.paths[9].name == "10.jpg"
-    assert data.truth.positives == 228
-    assert int(data.truth.queries_with_a_loop.sum()) == 44
-    assert data.name == "corridor_loop/samples"
-
-
-@pytest.mark.slow
-def test_tum_fr1():
-    data = load_sequence(read_sequence(shared("data/tum_fr1/rgbd_dataset_freiburg1_rpy"), "tum"))
-    assert len(data.queries.paths) == 721
-    assert data.truth.positives > 0

@@ -119,21 +119,6 @@ def test_extract_can_add_the_center_of_each_image(run: Run, images: Path) -> Non
     )
 
 
-@pytest.mark.parametrize("where", ["walk", "walk/rgb.txt"])
-def test_extract_keeps_the_order_and_the_stamps_of_a_tum_list(run: Run, images: Path, where: str) -> None:
-    assert run("extract", *IMAGES, "--images", where).status == 0
-    found = np.load("f.npz")
-    assert found["names"].tolist() == ["rgb/10.png", "rgb/1.png"]
-    assert found["stamps"].tolist() == [1.5, 2.25]
-    np.testing.assert_allclose(found["features"][1], features_of(images / "rgb" / "1.png"), rtol=1e-4, atol=1e-6)
-
-
-def test_extract_reads_caffes_lists_with_labels(run: Run, images: Path) -> None:
-    (images / "rgb" / "list.txt").write_text("2.png 1\n10.png 0\n")
-    assert run("extract", *IMAGES, "--images", images / "rgb" / "list.txt").status == 0
-    assert np.load("f.npz")["names"].tolist() == ["2.png", "10.png"]
-
-
 def test_extract_can_feed_the_other_tower(run: Run, images: Path) -> None:
     words = ["--model", NET, "--weights", INIT, "--blob", "feat_p", "--out", "g.npz", "--images", images / "rgb"]
     assert run("extract", *words, "--input", "data_p").status == 0

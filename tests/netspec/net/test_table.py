@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from netspec.inspect.check.check import as_json
 from netspec.net.net import Net
 from netspec.net.table import table
 
@@ -41,10 +40,3 @@ def test_long_names_are_shortened_in_the_middle_in_a_narrow_table(net_of: Callab
     lines = table(net.plan, list(net.layers), 80).splitlines()
     assert max(map(len, lines)) <= 80
     assert any(line.startswith("inception") and "…" in line and "_reduce" in line for line in lines)
-
-
-def test_as_json_contains_shapes_parameters_inputs_and_outputs(net_of: Callable[..., Net]) -> None:
-    found = as_json(net_of(NET))
-    assert found["params"] == {"left": [[4, 3]], "right": [[4, 3]]}
-    assert found["blobs"]["fa"] == [2, 4]
-    assert (found["inputs"], found["outputs"]) == (["a", "b"], ["loss"])

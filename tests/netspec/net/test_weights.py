@@ -131,29 +131,6 @@ def test_hdf5_weights_have_the_structure_of_caffes(golden_net, tmp_path: Path):
                 np.testing.assert_array_equal(written[()], wanted[()])
 
 
-@pytest.mark.parametrize("name", ["w.caffemodel", "w.caffemodel.h5"])
-def test_written_weights_are_read_back(name: str, tmp_path: Path):
-    net = net_of(TOWERS)
-    fill(net)
-    save_weights(net, tmp_path / name)
-    other = net_of(TOWERS, seed=2)
-    load_weights(other, tmp_path / name)
-    for layer, blobs in blobs_of(net).items():
-        for mine, theirs in zip(blobs, blobs_of(other)[layer], strict=True):
-            np.testing.assert_array_equal(mine, theirs)
-    assert other.params["ip"][0] is other.params["ip/p"][0]
-
-
-def test_net_to_proto_lists_the_layers_in_order_with_their_blobs():
-    proto = net_to_proto(net_of(TOWERS))
-    assert proto.name == "towers"
-    assert [layer.name for layer in proto.layer] == ["in", "ip", "x_ip_0_split", "ip/p", "sum", "twice"]
-    assert all(layer.phase == 0 and layer.HasField("phase") for layer in proto.layer)
-    assert [len(layer.blobs) for layer in proto.layer] == [0, 2, 0, 2, 0, 0]
-    assert list(proto.layer[3].blobs[0].shape.dim) == [4, 3]
-    assert not any(len(blob.diff) for layer in proto.layer for blob in layer.blobs)
-
-
 def test_gradients_are_written_on_request(tmp_path: Path):
     net = net_of(TOWERS)
     fill(net)

@@ -170,17 +170,6 @@ def test_a_snapshot_during_a_test_resumes_before_that_test() -> None:
     assert_same(training, resumed)
 
 
-def test_the_state_is_byte_identical_to_caffes_with_the_rest_in_another_file() -> None:
-    write(NETS["crop and mirror"])
-    solver = load_solver("solver.prototxt")
-    solver.step(2)
-    model, state = solver.snapshot()
-    write_state("again", State(2, model, 0, [values.numpy() for values in solver.history]))
-    assert Path("again").read_bytes() == Path(state).read_bytes()
-    found = json.loads(Path("x_iter_2.solverstate.extra").read_text())
-    assert found["nets"][0] == {"0": {"iteration": 2}}
-
-
 def test_without_the_extra_file_a_state_resumes_like_caffe(caplog: pytest.LogCaptureFixture) -> None:
     write(NETS["batches of 8 of 37"])
     solver = load_solver("solver.prototxt")

@@ -10,7 +10,7 @@ from netspec.errors import SpecError
 from netspec.load import load_solver
 from netspec.net.weights import load_weights
 from netspec.proto.schema import BlobProto, BlobShape, SolverState
-from netspec.solver.snapshot import State, find_learned_net, merge_shared, read_state, write_state
+from netspec.solver.snapshot import State, find_learned_net, read_state, write_state
 from netspec.solver.solver import Solver
 from paths import GOLDEN
 
@@ -44,16 +44,6 @@ def _contents(path: Path) -> dict[str, tuple]:
             )
         )
     return found
-
-
-@pytest.mark.parametrize("ending", ["solverstate", "solverstate.h5"])
-def test_written_files_can_be_read(ending: str, tmp_path: Path):
-    history = [np.arange(6, dtype=np.float32).reshape(2, 3), np.array([7, 8], np.float32)]
-    write_state(tmp_path / f"x.{ending}", State(123, "somewhere/x.caffemodel", 4, history))
-    state = read_state(tmp_path / f"x.{ending}")
-    assert (state.iteration, state.learned_net, state.current_step) == (123, "somewhere/x.caffemodel", 4)
-    for read, written in zip(state.history, history, strict=True):
-        np.testing.assert_array_equal(read, written)
 
 
 def test_weights_are_searched_next_to_the_state_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -145,26 +135,6 @@ def test_resume_from_caffes_hdf5_state(work_in: Callable[..., Path]):
     solver.close()
 
 
-@pytest.mark.parametrize("case", ["adam", "adadelta", "rmsprop"])
-@pytest.mark.parametrize("form", ["BINARYPROTO", "HDF5"])
-def test_resuming_from_a_snapshot_is_bit_identical(case: str, form: str, work_in: Callable[..., Path]):
-    """After 20 batches of 32 the 640 records begin again, in the run itself as in the resumed one."""
-    work_in(f"train/{case}")
-    with open(f"{case}/solver.prototxt", "a") as file:
-        file.write(f"snapshot_format: {form}\n")
-    solver = load_solver(f"{case}/solver.prototxt", weights=f"{case}/init.caffemodel")
-    solver.step(20)
-    _, state = solver.snapshot()
-    solver.step(5)
-    straight = [item.parameter.detach().clone() for item in solver.net.learnable]
-    solver.close()
-    again = load_solver(f"{case}/solver.prototxt", snapshot=state)
-    again.step(5)
-    for mine, item in zip(straight, again.net.learnable, strict=True):
-        assert torch.equal(mine, item.parameter)
-    again.close()
-
-
 def test_a_state_of_another_solver_or_net_is_refused_and_changes_nothing(work_in: Callable[..., Path]):
     work_in("train/adam")
     work_in("train/residual_bn_shared")
@@ -224,9 +194,3 @@ def test_histories_of_shared_parameters_are_added(
     with pytest.raises(SpecError, match=r"odd\.solverstate: history blob 9 has shape \(7, 1, 1, 6\), expected \(6,\)"):
         solver.restore("sgd_step/odd.solverstate")
     solver.close()
-
-
-def test_the_second_set_of_shared_histories_follows_the_first():
-    history = [np.array([k], np.float32) for k in (1, 10, 2, 3, 30, 4)]
-    assert [array.tolist() for array in merge_shared(history, [0, 1, 0])] == [[3], [10], [7], [30]]
-    assert merge_shared([np.array([[5]], np.float32), np.array([5], np.float32)], [0, 0])[0].tolist() == [[5]]

@@ -147,15 +147,6 @@ def test_the_first_layer_of_a_name_is_shared_with_a_test_net(make):
     assert second.unique().tolist() == [2]
 
 
-def test_iter_size_takes_the_mean_of_its_passes(make):
-    fixed = NET.replace('type: "gaussian" std: 1 } data', "value: 2 } data")
-    once, thrice = make("", net=fixed), make("iter_size: 3", net=fixed)
-    once.step(4)
-    thrice.step(4)
-    assert thrice.loss == pytest.approx(once.loss, rel=1e-5)
-    torch.testing.assert_close(weights(thrice), weights(once))
-
-
 # What moves
 
 

@@ -8,7 +8,7 @@ from netspec.errors import Where
 from netspec.proto.schema import SolverParameter
 from netspec.proto.source_map import Position
 from netspec.solver import update
-from netspec.solver.update import RULES, Piece, Tensors, clip, cut, move, normalize, regularize, rule_faults
+from netspec.solver.update import RULES, Piece, Tensors, cut, move, rule_faults
 
 NOWHERE = Position(Where("s.prototxt"))
 SHAPES = [(3, 2), (4,)]
@@ -35,39 +35,6 @@ def gradients() -> list[Tensors]:
     return [[torch.randn(shape, generator=generator) for shape in SHAPES] for _ in range(6)]
 
 
-@pytest.mark.parametrize(
-    ("fields", "torch_class", "settings"),
-    [
-        ({"type": "SGD", "momentum": 0.9}, torch.optim.SGD, {"momentum": 0.9}),
-        ({"type": "SGD"}, torch.optim.SGD, {}),
-        ({"type": "Nesterov", "momentum": 0.9}, torch.optim.SGD, {"momentum": 0.9, "nesterov": True}),
-        ({"type": "AdaGrad", "delta": 0.01}, torch.optim.Adagrad, {"eps": 0.01}),
-        ({"type": "RMSProp", "rms_decay": 0.9, "delta": 0.01}, torch.optim.RMSprop, {"alpha": 0.9, "eps": 0.01}),
-        ({"type": "AdaDelta", "momentum": 0.95, "delta": 1e-3}, torch.optim.Adadelta, {"rho": 0.95, "eps": 1e-3}),
-        ({"type": "Adam", "momentum": 0.9, "delta": 0}, torch.optim.Adam, {"betas": (0.9, 0.999), "eps": 0}),
-    ],
-)
-def test_at_a_constant_rate_rules_equal_torchs(fields, torch_class, settings, gradients):
-    weights, _ = run(SolverParameter(**fields), gradients, [0.1] * len(gradients))
-    theirs = [torch.nn.Parameter(torch.zeros(shape)) for shape in SHAPES]
-    groups = [{"params": [theirs[0]], "lr": 0.1}, {"params": [theirs[1]], "lr": 0.2}]
-    optimizer = torch_class(groups, **settings)
-    for diffs in gradients:
-        for parameter, diff in zip(theirs, diffs, strict=True):
-            parameter.grad = diff.clone()
-        optimizer.step()
-    for mine, parameter in zip(weights, theirs, strict=True):
-        torch.testing.assert_close(mine, parameter.data, rtol=1e-5, atol=1e-6)
-
-
-def test_sgd_keeps_the_old_rate_in_its_velocity():
-    """The rate is inside the history: after a step of the rate the old velocity goes on as it was."""
-    ones = [[torch.ones(shape) for shape in SHAPES]] * 2
-    weights, history = run(SolverParameter(momentum=0.5), ones, [1.0, 0.0])
-    assert torch.all(history[0] == 0.5)
-    assert torch.all(weights[0] == -1.5)
-
-
 def test_adam_adds_delta_before_the_bias_correction():
     ones = [[torch.ones(shape) for shape in SHAPES]]
     weights, _ = run(SolverParameter(type="Adam", momentum=0.9, momentum2=0.99, delta=0.1), ones, [1.0])
@@ -88,42 +55,6 @@ def test_a_rate_of_0_updates_only_the_history(gradients):
     diffs = [torch.zeros(shape) for shape in SHAPES]
     RULES["SGD"].compute(param, diffs, [0.0, 0.0], history, 0)
     assert torch.all(history[0] == torch.tensor(0.9))
-
-
-def test_the_second_set_of_the_history_follows_the_first(gradients):
-    _, history = run(SolverParameter(type="Adam", momentum=0.9), gradients, [0.1] * len(gradients))
-    assert [tuple(h.shape) for h in history] == SHAPES * 2
-    assert torch.all(history[2] >= 0)  # the squares
-    assert torch.any(history[0] < 0)  # the means
-
-
-def test_clip_scales_the_norm_of_all_gradients_together():
-    diffs = [torch.tensor([3.0]), torch.tensor([[4.0]])]
-    assert clip(diffs, 10) is None
-    assert clip(diffs, -1) is None
-    norm, factor = clip(diffs, 1) or (0, 0)
-    assert (norm, factor) == pytest.approx((5, 0.2))
-    torch.testing.assert_close(diffs, [torch.tensor([0.6]), torch.tensor([[0.8]])])
-
-
-def test_normalize_divides_by_iter_size():
-    diffs = [torch.tensor([3.0, 6.0])]
-    normalize(diffs, 3)
-    torch.testing.assert_close(diffs[0], torch.tensor([1.0, 2.0]))
-
-
-def test_weight_decay_differs_by_parameter():
-    weights = [torch.tensor([2.0, -4.0, 0.0]), torch.tensor([8.0])]
-    diffs = [torch.ones(3), torch.ones(1)]
-    regularize(diffs, weights, [0.5, 0.0], "L2")
-    assert diffs[0].tolist() == [2, -1, 1]
-    assert diffs[1].tolist() == [1]
-
-
-def test_l1_decay_uses_the_sign_and_keeps_0():
-    weights, diffs = [torch.tensor([2.0, -4.0, 0.0])], [torch.ones(3)]
-    regularize(diffs, weights, [0.5], "L1")
-    assert diffs[0].tolist() == [1.5, 0.5, 1]
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,7 @@
 """The log is Caffe's, line by line: what it printed for the same runs, and what people's log parsers make of it."""
 
 import re
-import time
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -94,52 +92,6 @@ def test_the_end_of_the_data_is_logged_each_time(run: Callable[[list[str]], list
     """60 batches of 32 end the 640 records three times, and each test's four of 50 the 200 records once."""
     ends = [line for line in run(TRAIN) if line.endswith("Restarting data prefetching from start.")]
     assert len(ends) == 3 + 3
-
-
-# What the tools that people have for Caffe's logs read, each rule as they apply it.
-
-
-@pytest.fixture
-def training_log(run: Callable[[list[str]], list[str]]) -> list[str]:
-    return run(TRAIN)
-
-
-def test_log_parsers_find_rates_losses_and_scores_by_iteration(training_log: list[str]) -> None:
-    iteration = -1
-    rates: dict[int, float] = {}
-    scores: dict[str, dict[int, float]] = {"Train": {}, "Test": {}}
-    for line in training_log:
-        if match := re.search(r"Iteration (\d+)", line):
-            iteration = int(match[1])
-        if match := re.search(r"lr = ([-+]?[0-9]*\.?[0-9]+([eE]?[-+]?[0-9]+)?)", line):
-            rates[iteration] = float(match[1])
-        if match := re.search(r"(Train|Test) net output #(\d+): (\S+) = ([\.\deE+-]+)", line):
-            assert (match[2], match[3]) == ("0", "loss")
-            scores[match[1]][iteration] = float(match[4])
-    assert rates == {0: 0.05, 10: 0.05, 20: 0.005, 30: 0.005, 40: 0.0005, 50: 0.0005}
-    assert scores["Train"] == pytest.approx(
-        {0: 0.153106, 10: 0.0442083, 20: 0.0583595, 30: 0.0435475, 40: 0.0523755, 50: 0.0370414}, rel=1e-4
-    )
-    assert list(scores["Test"]) == [0, 25, 50]
-    assert scores["Test"][25] == pytest.approx(0.0510559, rel=1e-4)
-
-
-def test_log_parsers_find_the_times_of_the_start_and_of_each_line(training_log: list[str]) -> None:
-    start = next(line for line in training_log if "Solving" in line)
-    moments = []
-    for line in training_log[training_log.index(start) :]:
-        day, clock = line.split()[:2]
-        moments.append(datetime.strptime(f"{time.localtime().tm_year}{day[1:]} {clock}", "%Y%m%d %H:%M:%S.%f"))
-    assert moments == sorted(moments)
-    assert abs((datetime.now() - moments[-1]).total_seconds()) < 3600
-
-
-def test_log_parsers_find_values_by_their_field(training_log: list[str]) -> None:
-    """Shell scripts count blanks: of a rate's line they take the ninth field, of a test score's the eleventh."""
-    rates = [line.split()[8] for line in training_log if ", lr = " in line]
-    assert rates == ["0.05", "0.05", "0.005", "0.005", "0.0005", "0.0005"]
-    scores = [float(line.split()[10]) for line in training_log if "Test net output #0" in line]
-    assert scores[1] == pytest.approx(0.0510559, rel=1e-4)
 
 
 # Numbers

@@ -72,14 +72,6 @@ def test_towers_that_share_only_some_parameters_are_found(advice: Callable[..., 
     ]
 
 
-def test_a_loss_without_learnable_parameters_is_found(advice: Callable[..., list[str]]) -> None:
-    fixed = 'param { name: "w" lr_mult: 0 } param { name: "b" lr_mult: 0 }'
-    assert advice(siamese((fixed, fixed))) == [
-        'net.prototxt:8:1: layer "loss" (ContrastiveLoss): this loss depends on no learnable parameter; is lr_mult 0?'
-    ]
-    assert advice(siamese((fixed, fixed)), phase=1) == []
-
-
 def test_an_unused_blob_is_found(advice: Callable[..., list[str]]) -> None:
     spare = 'layer { name: "spare" type: "ReLU" bottom: "f1" top: "spare" }\n'
     assert advice(siamese(extra=spare)) == [
@@ -93,16 +85,6 @@ def test_an_unused_blob_is_found(advice: Callable[..., list[str]]) -> None:
 
 def test_outputs_of_a_net_without_a_loss_are_not_found_as_unused(advice: Callable[..., list[str]]) -> None:
     assert advice('layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 1 } } }') == []
-
-
-def test_a_batch_norm_without_scale_is_found(advice: Callable[..., list[str]]) -> None:
-    norm = 'layer { name: "x" type: "Input" top: "x" input_param { shape { dim: 2 dim: 3 } } }\n'
-    norm += 'layer { name: "bn" type: "BatchNorm" bottom: "x" top: "y" }\n'
-    assert advice(norm) == [
-        'net.prototxt:2:1: layer "bn" (BatchNorm): no Scale layer follows; Caffe\'s BatchNorm itself does not scale '
-        "and shift"
-    ]
-    assert advice(norm + 'layer { name: "s" type: "Scale" bottom: "y" top: "y" }') == []
 
 
 def test_two_layers_of_one_name_are_found(advice: Callable[..., list[str]]) -> None:
@@ -158,24 +140,6 @@ def test_a_training_without_snapshots_is_found(advice: Callable[..., list[str]])
         "solver.prototxt: no snapshot is taken; set snapshot, or snapshot_after_train: true"
     ]
     assert advice(in_phases(siamese()), without + "snapshot: 100") == []
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ("gamma: 0.1", ["3:1: gamma has no effect with type SGD and lr_policy fixed; remove it"]),
-        ("stepvalue: 10 stepvalue: 20", ["3:1: stepvalue has no effect with type SGD and lr_policy fixed; remove it"]),
-        ('type: "Adam" momentum2: 0.9 delta: 1e-8', []),
-        ('type: "AdaGrad" delta: 1e-8', []),
-        ('type: "RMSProp" rms_decay: 0.9 momentum2: 0.9',
-         ["3:32: momentum2 has no effect with type RMSProp and lr_policy fixed; remove it"]),
-    ],
-    ids=["gamma", "stepvalue", "Adam", "AdaGrad", "RMSProp"],
-)  # fmt: skip
-def test_settings_that_the_policy_and_the_type_do_not_read_are_found(
-    advice: Callable[..., list[str]], settings: str, said: list[str]
-) -> None:
-    assert advice(in_phases(siamese()), SOLVER + settings) == [f"solver.prototxt:{line}" for line in said]
 
 
 @pytest.mark.parametrize(("iterations", "far"), [(20, False), (19, False), (22, False), (4, True), (64, True)])
