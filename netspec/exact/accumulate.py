@@ -7,63 +7,91 @@ autograd. The solver builds its nets in this way. Hooks on parameters, ``torch.a
 see the gradients of nets built without it.
 """
 
+# pyright: reportPrivateImportUsage=false
+
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from typing import Any, Protocol
 
 import torch
+from torch.autograd.function import once_differentiable
+
+from netspec.exact.blas import one_thread
+
+Diff = torch.Tensor | None
+Sums = Sequence[Diff]  # the tensors to which the gradients of parameters are added; None: not needed
 
 
-class _AddedAtOnce(torch.autograd.Function):
+class Operation(Protocol):
+    """A function of a bottom and of parameters that adds up the gradients of the parameters itself.
+
+    - ``forward(bottom, *parameters)`` returns the top. A parameter may be None.
+    - ``backward(diff, wanted, sums, bottom, *parameters)`` takes the gradient of the top, and returns that of the
+      bottom if it is ``wanted``. ``sums`` are the tensors to which it adds the gradients of the parameters; None for
+      those that are not needed.
+    """
+
+    @property
+    def forward(self) -> Callable[..., torch.Tensor]: ...
+
+    @property
+    def backward(self) -> Callable[..., Diff]: ...
+
+
+def applied(operation: Operation, by_blas: bool, in_place: bool, bottom: Diff, *parameters: Diff) -> Any:
+    """Return the top of an operation, with gradients; ``in_place`` adds those of parameters to ``grad`` at once.
+
+    ``by_blas``: whether it calls the routines of netspec/exact/blas.py.
+    """
+    return _Applied.apply(operation, by_blas, in_place, bottom, *parameters)
+
+
+class _Applied(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, parameter: torch.Tensor) -> torch.Tensor:
-        ctx.parameter = parameter
-        return parameter.view_as(parameter)
+    def forward(
+        ctx: Any, operation: Operation, by_blas: bool, in_place: bool, bottom: Diff, *parameters: Diff
+    ) -> torch.Tensor:
+        ctx.operation, ctx.by_blas = operation, by_blas
+        ctx.save_for_backward(bottom, *parameters)
+        ctx.adds = [in_place and isinstance(p, torch.nn.Parameter) and p.is_contiguous() for p in parameters]
+        with one_thread() if by_blas else nullcontext():
+            return operation.forward(bottom, *parameters)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
-        parameter = ctx.parameter
-        if parameter.grad is None:
-            parameter.grad = torch.zeros_like(parameter)
-        parameter.grad += gradients[0]
+    @once_differentiable
+    def backward(ctx: Any, diff: torch.Tensor) -> tuple[Diff, ...]:
+        bottom, *parameters = ctx.saved_tensors
+        wanted, *needed = ctx.needs_input_grad[3:]
+        sums = [
+            _sum(parameter, adds) if asked else None
+            for parameter, asked, adds in zip(parameters, needed, ctx.adds, strict=True)
+        ]
+        with one_thread() if ctx.by_blas else nullcontext():
+            found = ctx.operation.backward(diff, wanted, sums, bottom, *parameters)
+        returned = (None if added else total for added, total in zip(ctx.adds, sums, strict=True))
+        return None, None, None, found, *returned
+
+
+def _sum(parameter: torch.Tensor, adds: bool) -> torch.Tensor:
+    """Return the tensor to which the gradient of a parameter is added: its ``grad``, or zeros."""
+    if not adds:
+        return torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter)
+    return parameter.grad
 
 
 def added_at_once(parameter: torch.Tensor) -> torch.Tensor:
     """Return a parameter for one use; the gradient of this use is added to ``grad`` as soon as it is known."""
     is_learned = isinstance(parameter, torch.nn.Parameter) and parameter.requires_grad
-    return _AddedAtOnce.apply(parameter) if is_learned and parameter.is_contiguous() else parameter
+    return applied(_Use(), False, True, None, parameter) if is_learned and parameter.is_contiguous() else parameter
 
 
-class ParameterSums(torch.autograd.Function):
-    """Base of functions that add up the gradients of their parameters themselves.
+class _Use:
+    def forward(self, _: None, parameter: torch.Tensor) -> torch.Tensor:
+        return parameter.view_as(parameter)
 
-    Their arguments begin with one bottom, then the parameters, each a tensor or None.
-    """
-
-    @staticmethod
-    def keep(ctx: Any, bottom: torch.Tensor, parameters: Sequence[torch.Tensor | None], in_place: bool) -> None:
-        """Save the bottom and the parameters for backward, and whether it must add ``in_place``."""
-        ctx.save_for_backward(bottom, *parameters)
-        ctx.adds = [in_place and isinstance(p, torch.nn.Parameter) and p.is_contiguous() for p in parameters]
-
-    @staticmethod
-    def sums(ctx: Any) -> list[torch.Tensor | None]:
-        """Return where to add the gradient of each parameter; None if it is not needed."""
-        found: list[torch.Tensor | None] = []
-        needed = ctx.needs_input_grad[1 : 1 + len(ctx.adds)]
-        for parameter, asked, adds in zip(ctx.saved_tensors[1:], needed, ctx.adds, strict=True):
-            if not asked:
-                found.append(None)
-            elif not adds:
-                found.append(torch.zeros_like(parameter, memory_format=torch.contiguous_format))
-            else:
-                if parameter.grad is None:
-                    parameter.grad = torch.zeros_like(parameter)
-                found.append(parameter.grad)
-        return found
-
-    @staticmethod
-    def for_autograd(ctx: Any, sums: Sequence[torch.Tensor | None]) -> list[torch.Tensor | None]:
-        """Return the gradients for autograd to add; None for those that were already added."""
-        return [None if added else total for added, total in zip(ctx.adds, sums, strict=True)]
+    def backward(self, diff: torch.Tensor, wanted: bool, sums: Sequence[torch.Tensor], *_: Diff) -> None:
+        sums[0].add_(diff)

@@ -9,44 +9,44 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import libm, losses, lrn, sums
-from netspec.exact.accumulate import added_at_once
-from netspec.exact.blas import applies, is_recorded
+from netspec.exact.accumulate import Operation, added_at_once, applied
+from netspec.exact.blas import applies, is_recorded, sum_in_order
 from netspec.exact.by_torch import (
-    Floor,
-    Standardization,
     normalized_batch,
     normalizes,
     response_base,
     scales_channels,
+    standardized,
     standardized_gradient,
     window_sums,
 )
 from netspec.exact.channels import (
     BatchNormalization,
     ChannelProducts,
-    RowNormalization,
     Slopes,
+    normalized_rows,
     row_normalization_gradient,
 )
 from netspec.exact.layout import by_channel, channels_side_by_side, map_by_map, of_one_channel
 from netspec.exact.pointwise import CellUpdate, Gradient, lstm_unit, pointwise
 from netspec.exact.products import (
     Axes,
+    ChosenRows,
     ColumnProducts,
-    Columns,
     Filter,
     SpreadProducts,
+    SummedProducts,
+    VectorProducts,
+    columns,
     convolution,
     is_rounded,
 )
-from netspec.exact.vectors import ChosenRows, SummedProducts, VectorProducts
 
 Function = Callable[[torch.Tensor], torch.Tensor]
 
@@ -59,6 +59,14 @@ class AsTorch:
     def __init__(self, in_place: bool = False) -> None:
         self.in_place = in_place
 
+    def _applied(self, operation: Operation, bottom: torch.Tensor, *parameters: torch.Tensor | None) -> torch.Tensor:
+        return applied(operation, self.is_caffes, self.in_place, bottom, *parameters)
+
+    def _by_rows(self, products: Operation, vectors: torch.Tensor, *parameters: torch.Tensor | None) -> torch.Tensor:
+        """Return the products of vectors (..., K) by an operation on vectors (M, K)."""
+        found = self._applied(products, vectors.reshape(-1, vectors.shape[-1]), *parameters)
+        return found.reshape(*vectors.shape[:-1], found.shape[1])
+
     # Products with learned blobs
 
     def inner_product(
@@ -66,7 +74,7 @@ class AsTorch:
     ) -> torch.Tensor:
         """Multiply vectors (..., K) by a matrix (num_output, K), or (K, num_output) if transposed; add the bias."""
         if self.in_place and torch.is_grad_enabled():
-            return _by_rows(SummedProducts, vectors, weight, bias, transposed, True)
+            return self._by_rows(SummedProducts(transposed), vectors, weight, bias)
         return self.product_of_step(vectors, weight.t() if transposed else weight, bias)
 
     def product_of_step(
@@ -153,7 +161,7 @@ class AsTorch:
 
     def standardized(self, rows: torch.Tensor, eps: float | None) -> torch.Tensor:
         """Subtract each row's mean and, with an ``eps``, divide by its deviation + eps: (M, K)."""
-        return rows - rows.mean(dim=1, keepdim=True) if eps is None else Standardization.apply(rows, eps)
+        return rows - rows.mean(dim=1, keepdim=True) if eps is None else standardized(rows, eps)
 
     def standardized_gradient(
         self, rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float
@@ -202,7 +210,7 @@ class AsTorch:
 
     def floored(self, x: torch.Tensor, least: float) -> torch.Tensor:
         """Return max(x, least), with a gradient that also passes below it, as in Caffe's losses."""
-        return Floor.apply(x, least)
+        return pointwise(x, lambda x: x.clamp(min=least), lambda x, top, diff: diff)
 
     def lstm_unit(
         self, cell: torch.Tensor, gates: torch.Tensor, keep: torch.Tensor
@@ -273,7 +281,7 @@ class AsCaffe(AsTorch):
     def inner_product(
         self, vectors: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, transposed: bool = False
     ) -> torch.Tensor:
-        return _by_rows(VectorProducts, vectors, weight, bias, transposed, self.in_place)
+        return self._by_rows(VectorProducts(transposed), vectors, weight, bias)
 
     @override
     def product_of_step(
@@ -283,23 +291,23 @@ class AsCaffe(AsTorch):
 
     @override
     def chosen_rows(self, index: torch.Tensor, rows: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
-        return ChosenRows.apply(index.flatten(), rows, bias, self.in_place).reshape(*index.shape, rows.shape[1])
+        return self._applied(ChosenRows(), index.flatten(), rows, bias).reshape(*index.shape, rows.shape[1])
 
     @override
     def convolution(
         self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, sliding: Filter, group: int
     ) -> torch.Tensor:
-        return ColumnProducts.apply(maps, weight, bias, sliding, group, self.in_place)
+        return self._applied(ColumnProducts(sliding, group), maps, weight, bias)
 
     @override
     def deconvolution(
         self, maps: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, how: tuple[Filter, int], size: Axes
     ) -> torch.Tensor:
-        return SpreadProducts.apply(maps, weight, bias, how, self.in_place, size)
+        return self._applied(SpreadProducts(*how, size), maps, weight, bias)
 
     @override
     def columns(self, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
-        return Columns.apply(maps, sliding)
+        return columns(maps, sliding)
 
     @override
     def scaled(
@@ -308,11 +316,11 @@ class AsCaffe(AsTorch):
         operand = bias if factors is None else factors
         assert operand is not None
         values = data.reshape(math.prod(data.shape[:axis]), operand.numel(), -1)
-        return ChannelProducts.apply(values, factors, bias, self.in_place).reshape(data.shape)
+        return self._applied(ChannelProducts(), values, factors, bias).reshape(data.shape)
 
     @override
     def sloped(self, x: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
-        return Slopes.apply(x.reshape(*x.shape[:2], -1), slopes, self.in_place).reshape(x.shape)
+        return self._applied(Slopes(), x.reshape(*x.shape[:2], -1), slopes).reshape(x.shape)
 
     @override
     def normalized_batch(
@@ -330,7 +338,7 @@ class AsCaffe(AsTorch):
 
     @override
     def standardized(self, rows: torch.Tensor, eps: float | None) -> torch.Tensor:
-        return RowNormalization.apply(rows, eps)
+        return normalized_rows(rows, eps)
 
     @override
     def standardized_gradient(
@@ -340,7 +348,7 @@ class AsCaffe(AsTorch):
 
     @override
     def across_channels(self, maps: torch.Tensor, settings: lrn.Settings) -> torch.Tensor:
-        return lrn.AcrossChannels.apply(maps, settings)
+        return lrn.across_channels(maps, settings)
 
     @override
     def across_channels_gradient(
@@ -391,11 +399,11 @@ class AsCaffe(AsTorch):
 
     @override
     def sigmoid_cross_entropy(self, x: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-        return losses.SigmoidCrossEntropy.apply(x, targets)
+        return losses.sigmoid_cross_entropy(x, targets)
 
     @override
     def sums(self, x: torch.Tensor, axis: int | None = None, factor: float = 1.0) -> torch.Tensor:
-        return _of_rows(lambda rows: sums.RowSums.apply(rows, factor), x, axis)
+        return _of_rows(lambda rows: sums.row_sums(rows, factor), x, axis)
 
     @override
     def sums_of_magnitudes(self, x: torch.Tensor, axis: int | None = None) -> torch.Tensor:
@@ -407,7 +415,7 @@ class AsCaffe(AsTorch):
 
     @override
     def total(self, values: torch.Tensor) -> torch.Tensor:
-        return sums.SumInOrder.apply(values.flatten(), 0)
+        return pointwise(values.flatten(), sum_in_order, lambda values, _, diff: diff.expand_as(values))
 
     @override
     def infogain(self, scores: torch.Tensor, gain: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -438,12 +446,6 @@ _WAYS = {
     for is_caffes in (False, True)
     for adds in (False, True)
 }
-
-
-def _by_rows(products: Any, vectors: torch.Tensor, weight: torch.Tensor, *how: Any) -> torch.Tensor:
-    """Return the products of vectors (..., K) by a function of vectors (M, K)."""
-    found = products.apply(vectors.reshape(-1, vectors.shape[-1]), weight, *how)
-    return found.reshape(*vectors.shape[:-1], found.shape[1])
 
 
 def _of_rows(function: Function, x: torch.Tensor, axis: int | None) -> torch.Tensor:

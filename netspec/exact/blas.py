@@ -9,7 +9,7 @@ import ctypes
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
 from typing import Any
@@ -93,18 +93,29 @@ def gemm(
     matrix A or B is used N times. To a single matrix C, with ``add``, all products are added.
     """
     a, b = _without_gaps(a), _without_gaps(b)
-    flags = [ctypes.create_string_buffer(b"T" if t else b"N") for t in (b_t, a_t)]
-    sizes = [ctypes.c_int(n) for n in (c.shape[-1], c.shape[-2], a.shape[-2 if a_t else -1])]
-    factors = [_NUMBERS[c.dtype](n) for n in (1.0, add)]
-    rows = [ctypes.c_int(m.shape[-1]) for m in (b, a, c)]
-    head = [*map(ctypes.addressof, (*flags, *sizes, factors[0]))]
-    row_b, row_a, row_c, beta = map(ctypes.addressof, (*rows, factors[1]))
-    at_a, at_b, at_c = (m.data_ptr() for m in (a, b, c))
-    step_a, step_b, step_c = (_step(m) for m in (a, b, c))
-    call = _function("gemm", c.dtype)
+    call = _gemm(c.dtype, b_t, a_t, c.shape[-1], c.shape[-2], a.shape[-2 if a_t else -1], add)
+    at_a, at_b, at_c = a.data_ptr(), b.data_ptr(), c.data_ptr()
+    step_a, step_b, step_c = _step(a), _step(b), _step(c)
     for _ in range(_count(a, b, c)):
-        call(*head, at_b, row_b, at_a, row_a, beta, at_c, row_c)
+        call(at_b, at_a, at_c)
         at_a, at_b, at_c = at_a + step_a, at_b + step_b, at_c + step_c
+
+
+@lru_cache(maxsize=1024)
+def _gemm(
+    dtype: torch.dtype, first_t: bool, second_t: bool, rows: int, columns: int, length: int, add: bool
+) -> Callable[[int, int, int], None]:
+    """Return gemm for the addresses of two matrices and their product, all stored by columns."""
+    call, number = _function("gemm", dtype), _NUMBERS[dtype]
+    flags = [ctypes.create_string_buffer(b"T" if t else b"N") for t in (first_t, second_t)]
+    leading = (length if first_t else rows, columns if second_t else length, rows)
+    kept = (*flags, *map(ctypes.c_int, (rows, columns, length, *leading)), number(1), number(add))
+    *head, of_first, of_second, of_product, alpha, beta = map(ctypes.addressof, kept)
+
+    def run(first: int, second: int, product: int, _: Any = kept) -> None:
+        call(*head, alpha, first, of_first, second, of_second, beta, product, of_product)
+
+    return run
 
 
 def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0) -> None:
@@ -115,17 +126,28 @@ def add_sums(a: torch.Tensor, sums: torch.Tensor, axis: int, factor: float = 1.0
     """
     a = _without_gaps(a)
     ones = torch.ones(a.shape[axis - 2], dtype=a.dtype)
-    flag = ctypes.create_string_buffer(b"T" if axis == 1 else b"N")
-    rows, columns, step = (ctypes.c_int(n) for n in (a.shape[-2], a.shape[-1], 1))
-    alpha, beta = (_NUMBERS[a.dtype](n) for n in (factor, 1.0))
-    head = [*map(ctypes.addressof, (flag, columns, rows, alpha))]
-    row, one, plus = map(ctypes.addressof, (columns, step, beta))
+    call = _gemv(a.dtype, axis == 1, a.shape[-1], a.shape[-2], factor)
     at_ones, at_a, at_sums, step_a = ones.data_ptr(), a.data_ptr(), sums.data_ptr(), _step(a)
     step_sums = sums.stride(0) * sums.element_size() if sums.dim() == 2 else 0
-    call = _function("gemv", a.dtype)
     for _ in range(_count(a)):
-        call(*head, at_a, row, at_ones, one, plus, at_sums, one)
+        call(at_a, at_ones, at_sums)
         at_a, at_sums = at_a + step_a, at_sums + step_sums
+
+
+@lru_cache(maxsize=1024)
+def _gemv(
+    dtype: torch.dtype, transposed: bool, rows: int, columns: int, factor: float
+) -> Callable[[int, int, int], None]:
+    """Return gemv for the addresses of a matrix, stored by columns, of a vector and of the sums to add to."""
+    call, number = _function("gemv", dtype), _NUMBERS[dtype]
+    flag = ctypes.create_string_buffer(b"T" if transposed else b"N")
+    kept = (flag, ctypes.c_int(rows), ctypes.c_int(columns), number(factor), ctypes.c_int(1), number(1))
+    flag_at, rows_at, columns_at, alpha, one, beta = map(ctypes.addressof, kept)
+
+    def run(matrix: int, vector: int, sums: int, _: Any = kept) -> None:
+        call(flag_at, rows_at, columns_at, alpha, matrix, rows_at, vector, one, beta, sums, one)
+
+    return run
 
 
 _NUMBERS = {torch.float32: ctypes.c_float, torch.float64: ctypes.c_double}
@@ -145,21 +167,22 @@ def _function(name: str, dtype: torch.dtype) -> Callable[..., None]:
 
 
 def _count(*matrices: torch.Tensor) -> int:
-    return max((len(m) for m in matrices if m.dim() == 3), default=1)
+    return max([len(m) for m in matrices if m.dim() == 3], default=1)
 
 
 def _without_gaps(matrices: torch.Tensor) -> torch.Tensor:
     """Return matrices, or a copy if there are gaps between their rows, as in a part of a blob after a Slice."""
+    return matrices if matrices.is_contiguous() or _are_stored_by_rows(matrices) else matrices.contiguous()
+
+
+def _are_stored_by_rows(matrices: torch.Tensor) -> bool:
     rows, columns = matrices.shape[-2:]
-    side_by_side = (matrices.stride(-1) == 1 or columns == 1) and (matrices.stride(-2) == columns or rows == 1)
-    return matrices if side_by_side else matrices.contiguous()
+    return (matrices.stride(-1) == 1 or columns == 1) and (matrices.stride(-2) == columns or rows == 1)
 
 
 def _step(matrices: torch.Tensor) -> int:
     """Return the bytes from one matrix to the next; 0 for a single one. The rows must have no gaps."""
-    rows, columns = matrices.shape[-2:]
-    assert matrices.stride(-1) == 1 or columns == 1, "the numbers of a row must be contiguous"
-    assert matrices.stride(-2) == columns or rows == 1, "the rows of a matrix must be contiguous"
+    assert matrices.is_contiguous() or _are_stored_by_rows(matrices), "the rows of a matrix must be contiguous"
     return matrices.stride(0) * matrices.element_size() if matrices.dim() == 3 else 0
 
 

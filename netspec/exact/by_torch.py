@@ -10,54 +10,34 @@ from torch.nn import functional as F
 
 from netspec.exact.layout import by_channel, of_one_layout
 from netspec.exact.lrn import Settings
+from netspec.exact.pointwise import pointwise
 
 MAX_OFFSET = 8  # the largest mean, in standard deviations, for which torch's CPU kernel is exact to 1e-6
 
 
-class Floor(torch.autograd.Function):
-    """max(x, floor), with a gradient that also passes below the floor, as in Caffe's losses."""
-
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, floor: float) -> torch.Tensor:
-        return x.clamp(min=floor)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return grads[0], None
-
-
-class Standardization(torch.autograd.Function):
+def standardized(rows: torch.Tensor, eps: float) -> torch.Tensor:
     """Normalize rows to mean 0 and standard deviation 1, with Caffe's gradient.
 
     Caffe differentiates as if ``eps`` were 0, and then divides by the deviation plus ``eps``. So a constant row has a
     finite gradient, while autograd returns NaN.
     """
 
-    @staticmethod
-    def forward(ctx: Any, rows: torch.Tensor, eps: float) -> torch.Tensor:
+    def compute(rows: torch.Tensor) -> torch.Tensor:
         centered = rows - rows.mean(dim=1, keepdim=True)
-        deviation = _deviation(centered, eps)
-        top = centered / deviation
-        ctx.save_for_backward(top, deviation)
-        return top
+        return centered / _deviation(centered, eps)
 
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return _standardized_gradient(*ctx.saved_tensors, *grads), None
+    return pointwise(rows, compute, lambda rows, top, diff: standardized_gradient(rows, top, diff, eps))
 
 
 def standardized_gradient(rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float) -> torch.Tensor:
-    """Return the gradient of Standardization from its rows and ``tops``, which may have been overwritten."""
-    return _standardized_gradient(tops, _deviation(rows - rows.mean(dim=1, keepdim=True), eps), diff)
+    """Return the gradient of :func:`standardized` from its rows and ``tops``, which may have been overwritten."""
+    along = (diff * tops).mean(dim=1, keepdim=True)
+    deviation = _deviation(rows - rows.mean(dim=1, keepdim=True), eps)
+    return (diff - diff.mean(dim=1, keepdim=True) - along * tops) / deviation
 
 
 def _deviation(centered: torch.Tensor, eps: float) -> torch.Tensor:
     return centered.square().mean(dim=1, keepdim=True).sqrt() + eps
-
-
-def _standardized_gradient(top: torch.Tensor, deviation: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
-    along = (grad * top).mean(dim=1, keepdim=True)
-    return (grad - grad.mean(dim=1, keepdim=True) - along * top) / deviation
 
 
 def response_base(maps: torch.Tensor, settings: Settings) -> torch.Tensor:

@@ -13,11 +13,12 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from netspec.exact import libm
-from netspec.exact.accumulate import ParameterSums
+from netspec.exact.accumulate import Diff, Sums
 from netspec.exact.blas import add_sums, dot, one_thread, sum_in_order
+from netspec.exact.pointwise import pointwise
 
 
-class ChannelProducts(ParameterSums):
+class ChannelProducts:
     """Multiply each channel by a factor and add a bias; one of them may be missing.
 
     values   (outer, channels, inner)
@@ -28,29 +29,21 @@ class ChannelProducts(ParameterSums):
     Caffe: src/caffe/layers/scale_layer.cpp, bias_layer.cpp
     """
 
-    @staticmethod
-    def forward(
-        ctx: Any, values: torch.Tensor, factors: torch.Tensor | None, bias: torch.Tensor | None, in_place: bool
-    ) -> torch.Tensor:
-        ParameterSums.keep(ctx, values, (factors, bias), in_place)
+    def forward(self, values: torch.Tensor, factors: Diff, bias: Diff = None) -> torch.Tensor:
         tops = values.clone() if factors is None else values * factors.reshape(-1, 1)
         return tops if bias is None else tops.add_(bias.reshape(-1, 1))
 
-    @staticmethod
-    @once_differentiable
-    @one_thread()
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
-        values, factors, _ = ctx.saved_tensors
-        factors_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        diff = diff.contiguous()
+    def backward(
+        self, diff: torch.Tensor, wanted: bool, sums: Sums, values: torch.Tensor, factors: Diff, *_: Diff
+    ) -> Diff:
+        (factors_sums, bias_sums), diff = sums, diff.contiguous()
         if bias_sums is not None:
             add_sums(diff, bias_sums.view(-1), axis=1)
         if factors_sums is not None:
             _add_products(values * diff, factors_sums.view(-1))
-        values_diff = None
-        if ctx.needs_input_grad[0]:
-            values_diff = diff if factors is None else diff * factors.reshape(-1, 1)
-        return values_diff, *ParameterSums.for_autograd(ctx, sums), None
+        if not wanted:
+            return None
+        return diff if factors is None else diff * factors.reshape(-1, 1)
 
 
 def _add_products(products: torch.Tensor, sums: torch.Tensor) -> None:
@@ -86,7 +79,7 @@ def _channel_sums(values: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
     return sums
 
 
-class Slopes(ParameterSums):
+class Slopes:
     """Multiply negative values by a slope, one for each channel or a single one.
 
     values   (outer, channels, inner)
@@ -96,24 +89,19 @@ class Slopes(ParameterSums):
     Caffe: src/caffe/layers/prelu_layer.cpp
     """
 
-    @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, slopes: torch.Tensor, in_place: bool) -> torch.Tensor:
-        ParameterSums.keep(ctx, values, (slopes,), in_place)
+    def forward(self, values: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
         return torch.where(values > 0, values, values * slopes.reshape(-1, 1))
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
-        values, slopes = ctx.saved_tensors
-        (slopes_sums,) = sums = ParameterSums.sums(ctx)
-        if slopes_sums is not None:
+    def backward(
+        self, diff: torch.Tensor, wanted: bool, sums: Sums, values: torch.Tensor, slopes: torch.Tensor
+    ) -> Diff:
+        if sums[0] is not None:
             terms = (diff * values * (values <= 0)).transpose(0, 1).flatten(1)
             if slopes.numel() == 1:
                 terms = terms.view(len(terms), len(values), -1).transpose(0, 1).reshape(1, -1)
-            flat = slopes_sums.view(-1, 1)
+            flat = sums[0].view(-1, 1)
             flat.copy_(sum_in_order(torch.cat([flat, terms], 1), 1).unsqueeze(1))
-        values_diff = torch.where(values > 0, diff, diff * slopes.reshape(-1, 1)) if ctx.needs_input_grad[0] else None
-        return values_diff, *ParameterSums.for_autograd(ctx, sums), None
+        return torch.where(values > 0, diff, diff * slopes.reshape(-1, 1)) if wanted else None
 
 
 class BatchNormalization(torch.autograd.Function):
@@ -150,51 +138,34 @@ class BatchNormalization(torch.autograd.Function):
         return (diff + sums * (-1 / count)).div_(deviation[:, None]), None
 
 
-class RowNormalization(torch.autograd.Function):
-    """Subtract each row's mean and, with an ``eps``, divide by its standard deviation + eps.
-
-    rows     (M, K)
-    returns  (M, K)
+def normalized_rows(rows: torch.Tensor, eps: float | None) -> torch.Tensor:
+    """Subtract each row's mean and, with an ``eps``, divide by its standard deviation + eps: (M, K).
 
     Caffe: src/caffe/layers/mvn_layer.cpp
     """
 
-    @staticmethod
     @one_thread()
-    def forward(ctx: Any, rows: torch.Tensor, eps: float | None) -> torch.Tensor:
+    def compute(rows: torch.Tensor) -> torch.Tensor:
         centered = rows - _row_means(rows)
-        if eps is None:
-            ctx.save_for_backward()
-            return centered
-        deviation = _deviations(centered, eps)
-        tops = centered / deviation
-        ctx.save_for_backward(tops, deviation)
-        return tops
+        return centered if eps is None else centered / _deviations(centered, eps)
 
-    @staticmethod
-    @once_differentiable
-    @one_thread()
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        diff = diff.contiguous()
-        if not ctx.saved_tensors:
-            return diff - _row_means(diff), None
-        tops, deviation = ctx.saved_tensors
-        return _normalization_gradient(tops, deviation, diff), None
+    return pointwise(rows, compute, lambda rows, tops, diff: row_normalization_gradient(rows, tops, diff, eps))
 
 
 @one_thread()
-def row_normalization_gradient(rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float) -> torch.Tensor:
-    """Return the gradient of RowNormalization, (M, K), from ``tops`` that may be overwritten."""
-    return _normalization_gradient(tops, _deviations(rows - _row_means(rows), eps), diff.contiguous())
+def row_normalization_gradient(
+    rows: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, eps: float | None
+) -> torch.Tensor:
+    """Return the gradient of :func:`normalized_rows`, (M, K), from ``tops`` that may be overwritten."""
+    diff = diff.contiguous()
+    if eps is None:
+        return diff - _row_means(diff)
+    sums = tops * _row_sums(tops * diff) + _row_sums(diff)
+    return (diff + sums * (-1 / diff.shape[1])).div_(_deviations(rows - _row_means(rows), eps))
 
 
 def _deviations(centered: torch.Tensor, eps: float) -> torch.Tensor:
     return libm.power(_row_means(libm.power(centered, 2)), 0.5) + eps
-
-
-def _normalization_gradient(tops: torch.Tensor, deviation: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
-    sums = tops * _row_sums(tops * diff) + _row_sums(diff)
-    return (diff + sums * (-1 / diff.shape[1])).div_(deviation)
 
 
 def _row_sums(rows: torch.Tensor, factor: float = 1.0) -> torch.Tensor:

@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from netspec.exact import libm
 from netspec.exact.blas import add_sums, dots, one_thread, sum_in_order
+from netspec.exact.pointwise import pointwise
 
 
 @one_thread()
@@ -28,24 +29,17 @@ def softmax_gradient(p: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
     return (diff - dots(diff, p).unsqueeze(1)) * p
 
 
-class SigmoidCrossEntropy(torch.autograd.Function):
+def sigmoid_cross_entropy(x: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the cross entropy of sigmoid(x) and the target, of each number.
 
     Caffe: src/caffe/layers/sigmoid_cross_entropy_loss_layer.cpp
     """
 
-    @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(x, target)
+    def compute(x: torch.Tensor) -> torch.Tensor:
         positive = (x >= 0).to(x.dtype)
         return libm.log(1 + libm.exp(x - 2 * x * positive)) - x * (target - positive)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return sigmoid(x) - target times the losses' gradient."""
-        x, target = ctx.saved_tensors
-        return (libm.sigmoid(x) - target) * diff, None
+    return pointwise(x, compute, lambda x, _, diff: (libm.sigmoid(x) - target) * diff)
 
 
 class Infogain(torch.autograd.Function):

@@ -7,10 +7,9 @@ Caffe: src/caffe/layers/lrn_layer.cpp
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from netspec.exact import libm
@@ -45,37 +44,23 @@ def within_channel(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
     return Product.apply(True, maps, pointwise(means, roots, gradient))
 
 
-class AcrossChannels(torch.autograd.Function):
+def across_channels(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
     """Divide each value by a power of the squares in the channels around it: (k + alpha / size * their sum) ** beta.
-
-    maps     (N, C, H, W)
-    returns  (N, C, H, W)
 
     The sums run from channel to channel; each step of them rounds once, as BLAS' axpy does.
     """
 
-    @staticmethod
-    def forward(ctx: Any, maps: torch.Tensor, settings: Settings) -> torch.Tensor:
+    def compute(maps: torch.Tensor) -> torch.Tensor:
         size, alpha, beta, k = settings
-        base = _forward_sums(maps * maps, size, alpha / size, k)
-        ctx.save_for_backward(maps, base)
-        ctx.settings = settings
-        return libm.power(base, -beta) * maps
+        return libm.power(_forward_sums(maps * maps, size, alpha / size, k), -beta) * maps
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[Any, ...]:
-        maps, base = ctx.saved_tensors
-        size, alpha, beta, _ = ctx.settings
-        roots = libm.power(base, -beta)
-        sums = _backward_sums(diff * (roots * maps) / base, size)
-        return torch.add(diff * roots, maps * sums, alpha=-2 * alpha * beta / size), None
+    return pointwise(maps, compute, lambda maps, tops, diff: across_channels_gradient(maps, tops, diff, settings))
 
 
 def across_channels_gradient(
     maps: torch.Tensor, tops: torch.Tensor, diff: torch.Tensor, settings: Settings
 ) -> torch.Tensor:
-    """Return the gradient of AcrossChannels, (N, C, H, W), from ``tops`` that may have been overwritten."""
+    """Return the gradient of :func:`across_channels`, (N, C, H, W), from ``tops`` that may have been overwritten."""
     size, alpha, beta, k = settings
     base = _forward_sums(maps * maps, size, alpha / size, k)
     sums = _backward_sums(diff * tops / base, size)

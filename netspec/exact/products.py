@@ -1,24 +1,28 @@
-"""Matrix products with learned filters: Convolution, Deconvolution."""
+"""Products with learned parameters: Convolution, Deconvolution, InnerProduct, Embed, and the steps of RNN and LSTM."""
 
 # pyright: reportPrivateImportUsage=false
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import torch
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from netspec.exact.accumulate import ParameterSums
-from netspec.exact.blas import add_sums, gemm, one_thread
+from netspec.exact.accumulate import Diff, Sums
+from netspec.exact.blas import add_sums, gemm
 from netspec.exact.layout import by_channel
+from netspec.exact.pointwise import pointwise
 
 Axes = tuple[int, ...]
 COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into a CPU's cache
+FEWEST_VECTORS = 64  # for fewer, the product takes less time than rounding the weights to another precision
 
 
 @dataclass(frozen=True)
@@ -50,14 +54,11 @@ class Filter:
 
     def columns(self, maps: torch.Tensor) -> torch.Tensor:
         """Return the pixels under each position of the filter as a column (im2col): (N, C kernel, positions)."""
-        axes = len(self.kernel)
-        windows = F.pad(maps, [p for pad in reversed(self.pad) for p in (pad, pad)]) if any(self.pad) else maps
-        for axis in range(axes):
-            extent = self.dilation[axis] * (self.kernel[axis] - 1) + 1
-            windows = windows.unfold(2 + axis, extent, self.stride[axis])[..., :: self.dilation[axis]]
-        columns = windows.permute(0, 1, *range(2 + axes, 2 + 2 * axes), *range(2, 2 + axes))
-        pixels, positions = math.prod(self.kernel), math.prod(self.fits(maps.shape[2:]))
-        return columns.reshape(len(maps), maps.shape[1] * pixels, positions).contiguous()
+        windows = _windows(self, maps.shape[1], maps.shape[2:])
+        if any(self.pad):
+            maps = F.pad(maps, [p for pad in reversed(self.pad) for p in (pad, pad)])
+        pixels = maps.contiguous().as_strided((len(maps), *windows.layout), windows.strides)
+        return pixels.reshape(len(maps), windows.pixels, windows.positions)
 
     def spread(self, columns: torch.Tensor, size: Axes) -> torch.Tensor:
         """Add columns up to maps (N, C, size), one pixel of the filter at a time (col2im).
@@ -76,21 +77,33 @@ class Filter:
             padded[(*every, *under)] += pixels[(*every, *pixel)]
         return padded[(*every, *(slice(p, p + n) for n, p in zip(size, self.pad, strict=True)))]
 
-    def images_at_once(self, channels: int, size: Axes) -> int:
-        """Return the number of maps (channels, size) with columns of at most ``COLUMNS`` numbers together."""
-        return max(1, COLUMNS // (channels * math.prod(self.kernel) * math.prod(self.fits(size))))
+
+class _Windows(NamedTuple):
+    """The positions of a filter on the padded maps of an image."""
+
+    fits: Axes  # along each axis
+    positions: int
+    pixels: int  # under the filter at one position, of all channels
+    layout: Axes  # channels, the pixels along each axis, the positions along each axis
+    strides: Axes  # of an image, and of the layout
+    at_once: int  # images with columns of at most COLUMNS numbers together
 
 
-def _gemm_by_group(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, group: int, **how: bool) -> None:
-    """Multiply stacks of matrices group by group; the rows of a matrix are ordered by group."""
-    if group == 1:
-        gemm(a, b, c, **how)
-        return
-    for own in zip(*(m.unflatten(-2, (group, -1)).unbind(-3) for m in (a, b, c)), strict=True):
-        gemm(*own, **how)
+@lru_cache(maxsize=1024)
+def _windows(sliding: Filter, channels: int, size: Axes) -> _Windows:
+    """Return the positions of a filter on maps (channels, size)."""
+    fits = sliding.fits(size)
+    padded = [n + 2 * p for n, p in zip(size, sliding.pad, strict=True)]
+    steps = [math.prod(padded[axis + 1 :]) for axis in range(len(size))]  # from a pixel to the next
+    area, pixels, positions = math.prod(padded), channels * math.prod(sliding.kernel), math.prod(fits)
+    strides = [channels * area, area]
+    strides += [n * step for by in (sliding.dilation, sliding.stride) for n, step in zip(by, steps, strict=True)]
+    at_once = max(1, COLUMNS // max(1, pixels * positions))
+    return _Windows(tuple(fits), positions, pixels, (channels, *sliding.kernel, *fits), tuple(strides), at_once)
 
 
-class ColumnProducts(ParameterSums):
+@dataclass
+class ColumnProducts:
     """Cross-correlate maps with filters: the filters, times the pixels under the filter as columns, image by image.
 
     maps     (N, C, ...)
@@ -101,105 +114,84 @@ class ColumnProducts(ParameterSums):
     Caffe: src/caffe/layers/base_conv_layer.cpp, conv_layer.cpp
     """
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        maps: torch.Tensor,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        sliding: Filter,
-        group: int,
-        in_place: bool,
-    ) -> torch.Tensor:
-        """Return the responses; keep the maps, not their columns, which are larger by the filter's pixels."""
-        ParameterSums.keep(ctx, maps, (weight, bias), in_place)
-        ctx.sliding, ctx.group = sliding, group
-        ctx.at_once = sliding.images_at_once(maps.shape[1], maps.shape[2:])
+    sliding: Filter
+    group: int
+
+    def forward(self, maps: torch.Tensor, weight: torch.Tensor, bias: Diff = None) -> torch.Tensor:
+        filters, windows = weight.contiguous().flatten(1), _windows(self.sliding, maps.shape[1], maps.shape[2:])
+        tops = maps.new_empty((len(maps), len(weight), windows.positions))
+        for some, top in self._in_parts(maps, tops):
+            self._multiply(filters, self.sliding.columns(some), top)
+        if bias is not None:
+            tops.add_(bias.unsqueeze(1))
+        return tops.view(len(maps), len(weight), *windows.fits)
+
+    def backward(
+        self, diff: torch.Tensor, wanted: bool, sums: Sums, maps: torch.Tensor, weight: torch.Tensor, *_: Diff
+    ) -> Diff:
+        diff = diff.contiguous()
+        self.add_to_sums(diff, sums, maps, diff)
+        return self.spread(diff, weight, maps.shape[2:]) if wanted else None
+
+    def spread(self, values: torch.Tensor, weight: torch.Tensor, size: Axes) -> torch.Tensor:
+        """Return the products (N, C, size) of the transposed filters with values (N, num_output, ...), added up."""
         filters = weight.contiguous().flatten(1)
-        tops = maps.new_empty(len(maps), len(weight), *sliding.fits(maps.shape[2:]))
-        with one_thread():
-            for some, top in zip(maps.split(ctx.at_once), tops.flatten(2).split(ctx.at_once), strict=True):
-                _gemm_by_group(filters, sliding.columns(some), top, group)
-        return tops if bias is None else tops.add_(by_channel(bias, tops))
+        maps = values.new_empty(len(values), self.group * weight.shape[1], *size)
+        for some, few in self._in_parts(maps, values.flatten(2)):
+            columns = few.new_empty(len(few), self.group * filters.shape[1], few.shape[2])
+            self._multiply(filters, few, columns, a_t=True)
+            some.copy_(self.sliding.spread(columns, size))
+        return maps
 
-    @staticmethod
-    @once_differentiable
-    @one_thread()
-    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        maps, weight, _ = ctx.saved_tensors
-        weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        filters, diffs = weight.contiguous().flatten(1), tops_diff.contiguous().flatten(2)
+    def add_to_sums(self, responses: torch.Tensor, sums: Sums, maps: torch.Tensor, of_bias: torch.Tensor) -> None:
+        """Add the products of responses with the columns of maps, and the sums of ``of_bias``, in place."""
+        weight_sums, bias_sums = sums
         if bias_sums is not None:
-            add_sums(diffs, bias_sums, axis=1)
+            add_sums(of_bias.flatten(2), bias_sums, axis=1)
         if weight_sums is not None:
-            of_filters = weight_sums.flatten(1)
-            for some, diff in zip(maps.split(ctx.at_once), diffs.split(ctx.at_once), strict=True):
-                _gemm_by_group(diff, ctx.sliding.columns(some), of_filters, ctx.group, b_t=True, add=True)
-        maps_diff = None
-        if ctx.needs_input_grad[0]:
-            maps_diff = torch.empty_like(maps, memory_format=torch.contiguous_format)
-            columns = maps.new_empty(min(ctx.at_once, len(maps)), ctx.group * filters.shape[1], diffs.shape[2])
-            for some, diff in zip(maps_diff.split(ctx.at_once), diffs.split(ctx.at_once), strict=True):
-                _gemm_by_group(filters, diff, columns[: len(diff)], ctx.group, a_t=True)
-                some.copy_(ctx.sliding.spread(columns[: len(diff)], maps.shape[2:]))
-        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
+            for some, few in self._in_parts(maps, responses.flatten(2)):
+                self._multiply(few, self.sliding.columns(some), weight_sums.flatten(1), b_t=True, add=True)
+
+    def _in_parts(self, maps: torch.Tensor, others: torch.Tensor) -> Iterable[tuple[torch.Tensor, torch.Tensor]]:
+        """Return a batch in parts with columns that fit into a CPU's cache."""
+        at_once = _windows(self.sliding, maps.shape[1], maps.shape[2:]).at_once
+        if at_once >= len(maps):
+            return [(maps, others)]
+        return zip(maps.split(at_once), others.split(at_once), strict=True)
+
+    def _multiply(self, a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, **how: bool) -> None:
+        """Multiply stacks of matrices group by group; the rows of a matrix are ordered by group."""
+        if self.group == 1:
+            gemm(a, b, c, **how)
+            return
+        for own in zip(*(m.unflatten(-2, (self.group, -1)).unbind(-3) for m in (a, b, c)), strict=True):
+            gemm(*own, **how)
 
 
-class SpreadProducts(ParameterSums):
+@dataclass
+class SpreadProducts(ColumnProducts):
     """Spread each pixel by filters, like the backward pass of a convolution.
 
     maps     (N, C, ...)
     weight   (C, num_output / group, kernel)
     bias     (num_output,) or None
-    size     of the tops, (...)
-    returns  (N, num_output, ...)
+    returns  (N, num_output, ...), with the spatial axes ``size``
 
     Caffe: src/caffe/layers/base_conv_layer.cpp, deconv_layer.cpp
     """
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        maps: torch.Tensor,
-        weight: torch.Tensor,
-        bias: torch.Tensor | None,
-        geometry: tuple[Filter, int],
-        in_place: bool,
-        size: Axes,
-    ) -> torch.Tensor:
-        maps = maps.contiguous()
-        ParameterSums.keep(ctx, maps, (weight, bias), in_place)
-        sliding, group = ctx.sliding, ctx.group = geometry
-        channels = weight.shape[1] * group
-        ctx.at_once = sliding.images_at_once(channels, size)
-        filters, values = weight.contiguous().flatten(1), maps.flatten(2)
-        tops = maps.new_empty(len(maps), channels, *size)
-        columns = maps.new_empty(min(ctx.at_once, len(maps)), group * filters.shape[1], values.shape[2])
-        with one_thread():
-            for some, top in zip(values.split(ctx.at_once), tops.split(ctx.at_once), strict=True):
-                _gemm_by_group(filters, some, columns[: len(some)], group, a_t=True)
-                top.copy_(sliding.spread(columns[: len(some)], size))
+    size: Axes
+
+    def forward(self, maps: torch.Tensor, weight: torch.Tensor, bias: Diff = None) -> torch.Tensor:
+        tops = self.spread(maps.contiguous(), weight, self.size)
         return tops if bias is None else tops.add_(by_channel(bias, tops))
 
-    @staticmethod
-    @once_differentiable
-    @one_thread()
-    def backward(ctx: Any, tops_diff: torch.Tensor) -> tuple[Any, ...]:
-        maps, weight, _ = ctx.saved_tensors
-        weight_sums, bias_sums = sums = ParameterSums.sums(ctx)
-        filters, values = weight.contiguous().flatten(1), maps.flatten(2)
-        maps_diff = torch.empty_like(maps) if ctx.needs_input_grad[0] else None
-        for start in range(0, len(maps), ctx.at_once):
-            these = slice(start, start + ctx.at_once)
-            diff = tops_diff[these].contiguous()
-            if bias_sums is not None:
-                add_sums(diff.flatten(2), bias_sums, axis=1)
-            columns = ctx.sliding.columns(diff)
-            if weight_sums is not None:
-                _gemm_by_group(values[these], columns, weight_sums.flatten(1), ctx.group, b_t=True, add=True)
-            if maps_diff is not None:
-                _gemm_by_group(filters, columns, maps_diff[these].flatten(2), ctx.group)
-        return maps_diff, *ParameterSums.for_autograd(ctx, sums), None, None, None
+    def backward(
+        self, diff: torch.Tensor, wanted: bool, sums: Sums, maps: torch.Tensor, weight: torch.Tensor, *_: Diff
+    ) -> Diff:
+        diff = diff.contiguous()
+        self.add_to_sums(maps.contiguous(), sums, diff, diff)
+        return super().forward(diff, weight) if wanted else None
 
 
 def is_rounded(values: torch.Tensor) -> bool:
@@ -218,28 +210,103 @@ def convolution(
 ) -> torch.Tensor:
     """Return the convolution, or transposed convolution, of torch's kernel for the number of axes."""
     axes = len(sliding.kernel) - 1
-    if transposed:
-        function = (F.conv_transpose1d, F.conv_transpose2d, F.conv_transpose3d)[axes]
-        return function(maps, weight, bias, sliding.stride, sliding.pad, 0, group, sliding.dilation)
-    function = (F.conv1d, F.conv2d, F.conv3d)[axes]
-    return function(maps, weight, bias, sliding.stride, sliding.pad, sliding.dilation, group)
+    directions = (F.conv1d, F.conv2d, F.conv3d), (F.conv_transpose1d, F.conv_transpose2d, F.conv_transpose3d)
+    geometry = {"stride": sliding.stride, "padding": sliding.pad, "dilation": sliding.dilation}
+    return directions[transposed][axes](maps, weight, bias, groups=group, **geometry)
 
 
-class Columns(torch.autograd.Function):
-    """Copy the pixels under each position of a filter into a column.
-
-    maps     (N, C, ...)
-    returns  (N, C kernel, positions)
+def columns(maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
+    """Copy the pixels under each position of a filter into a column: (N, C, ...) to (N, C kernel, positions).
 
     Caffe: src/caffe/layers/im2col_layer.cpp
     """
+    return pointwise(maps, sliding.columns, lambda maps, _, diff: sliding.spread(diff.contiguous(), maps.shape[2:]))
 
-    @staticmethod
-    def forward(ctx: Any, maps: torch.Tensor, sliding: Filter) -> torch.Tensor:
-        ctx.sliding, ctx.size = sliding, maps.shape[2:]
-        return sliding.columns(maps)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return ctx.sliding.spread(diff.contiguous(), ctx.size), None
+@dataclass
+class VectorProducts:
+    """Multiply vectors by a matrix.
+
+    vectors  (M, K)
+    weight   (num_output, K), or (K, num_output) where ``transposed``
+    bias     (num_output,) or None
+    returns  (M, num_output)
+
+    Caffe: src/caffe/layers/inner_product_layer.cpp
+    """
+
+    transposed: bool
+
+    def forward(self, vectors: torch.Tensor, weight: torch.Tensor, bias: Diff = None) -> torch.Tensor:
+        tops = vectors.new_empty(len(vectors), weight.shape[1 if self.transposed else 0])
+        gemm(vectors, weight.contiguous(), tops, b_t=not self.transposed)
+        return tops if bias is None else tops.add_(bias)
+
+    def backward(
+        self, diff: torch.Tensor, wanted: bool, sums: Sums, vectors: torch.Tensor, weight: torch.Tensor, *_: Diff
+    ) -> Diff:
+        (weight_sums, bias_sums), vectors, diff = sums, vectors.contiguous(), diff.contiguous()
+        if weight_sums is not None:
+            gemm(*((vectors, diff) if self.transposed else (diff, vectors)), weight_sums, a_t=True, add=True)
+        if bias_sums is not None:
+            add_sums(diff, bias_sums, axis=0)
+        if not wanted:
+            return None
+        vectors_diff = torch.empty_like(vectors)
+        gemm(diff, weight.contiguous(), vectors_diff, b_t=self.transposed)
+        return vectors_diff
+
+
+class SummedProducts(VectorProducts):
+    """Like :class:`VectorProducts`, but with torch's kernels, on any device.
+
+    In contrast to torch's own function, it adds the gradient of the weights to the sum at once. In fully connected
+    layers it is the largest of all tensors, and allocating memory for it takes longer than the product itself.
+    """
+
+    def forward(self, vectors: torch.Tensor, weight: torch.Tensor, bias: Diff = None) -> torch.Tensor:
+        """Return the product. For few vectors it has the precision of the weights, even with autocast."""
+        few, kind = len(vectors) < FEWEST_VECTORS, weight.device.type
+        vectors = vectors.to(weight.dtype) if few else vectors
+        autocast = few and kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False) if autocast else nullcontext():
+            return F.linear(vectors, weight.t() if self.transposed else weight, bias)
+
+    def backward(
+        self, diff: torch.Tensor, wanted: bool, sums: Sums, vectors: torch.Tensor, weight: torch.Tensor, *_: Diff
+    ) -> Diff:
+        weight_sums, bias_sums = sums
+        kind = diff.dtype  # of the product, which autocast may have chosen
+        if weight_sums is not None:
+            given = vectors.to(kind)
+            factors = (given.t(), diff) if self.transposed else (diff.t(), given)
+            if weight_sums.dtype == kind:
+                weight_sums.addmm_(*factors)
+            else:
+                weight_sums += factors[0] @ factors[1]
+        if bias_sums is not None:
+            bias_sums += diff.sum(0)
+        return (diff @ (weight.t() if self.transposed else weight).to(kind)).to(vectors.dtype) if wanted else None
+
+
+class ChosenRows:
+    """Look up rows.
+
+    index    (M,), whole numbers
+    rows     (input_dim, num_output)
+    bias     (num_output,) or None
+    returns  (M, num_output)
+
+    Caffe: src/caffe/layers/embed_layer.cpp
+    """
+
+    def forward(self, index: torch.Tensor, rows: torch.Tensor, bias: Diff) -> torch.Tensor:
+        tops = rows[index]
+        return tops if bias is None else tops.add_(bias)
+
+    def backward(self, diff: torch.Tensor, _: bool, sums: Sums, index: torch.Tensor, *rows: Diff) -> None:
+        (rows_sums, bias_sums), diff = sums, diff.contiguous()
+        if rows_sums is not None:
+            rows_sums.index_add_(0, index, diff)  # one after the other
+        if bias_sums is not None:
+            add_sums(diff, bias_sums, axis=0)

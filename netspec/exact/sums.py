@@ -14,33 +14,14 @@ from netspec.exact.blas import dots, one_thread, sum_in_order, sum_of_magnitudes
 from netspec.exact.pointwise import pointwise
 
 
-class SumInOrder(torch.autograd.Function):
-    """Sum up along an axis, one value after the other (a plain loop of Caffe's)."""
-
-    @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, axis: int) -> torch.Tensor:
-        ctx.shape, ctx.axis = values.shape, axis
-        return sum_in_order(values, axis)
-
-    @staticmethod
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return each sum's gradient for each of its terms."""
-        return diff.unsqueeze(ctx.axis).expand(ctx.shape), None
-
-
-class RowSums(torch.autograd.Function):
+def row_sums(rows: torch.Tensor, factor: float) -> torch.Tensor:
     """Return the sum of each row times a factor: its product with a constant vector (caffe_cpu_dot), (M, K) to (M,)."""
 
-    @staticmethod
     @one_thread()
-    def forward(ctx: Any, rows: torch.Tensor, factor: float) -> torch.Tensor:
-        ctx.shape, ctx.factor = rows.shape, factor
+    def compute(rows: torch.Tensor) -> torch.Tensor:
         return dots(rows.unsqueeze(2), torch.full_like(rows, factor).unsqueeze(2)).squeeze(1)
 
-    @staticmethod
-    def backward(ctx: Any, diff: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Return each sum's gradient, times the factor, for each of its terms."""
-        return (diff * ctx.factor).unsqueeze(1).expand(ctx.shape), None
+    return pointwise(rows, compute, lambda rows, _, diff: (diff * factor).unsqueeze(1).expand_as(rows))
 
 
 @one_thread()

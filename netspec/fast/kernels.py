@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 
-from netspec.fast.products import PreparedColumns, PreparedVectors
+from netspec.data.blobs import Shape
+from netspec.exact.accumulate import Diff, Operation
+from netspec.exact.layout import in_shape
 from netspec.layers.contract.base import Layer
-from netspec.run.recorded import Diff
+from netspec.run.recorded import Kernels
 
 Kernel = Callable[..., Any]  # takes the bottoms; returns the top, or a tuple of tops
 
@@ -95,27 +96,37 @@ def with_activation(kernel: Kernel, activation: Activation | None) -> Kernel:
     return both
 
 
-def copies(blobs: Sequence[torch.Tensor], how: Inference) -> list[torch.Tensor]:
-    """Return copies of a layer's blobs, which its kernels for all shapes share."""
-    copy = partial(torch.clone, memory_format=torch.contiguous_format)
-    return [how.memo(f"copy {i}", partial(copy, blob)) for i, blob in enumerate(blobs)]
+def padded(parts: Sequence[Any]) -> tuple[Any, Any]:
+    """Return blobs 0 and 1 of a layer, or what belongs to them; None for blob 1 if it is missing."""
+    return parts[0], parts[1] if len(parts) > 1 else None
 
 
-def product_kernel(product: PreparedVectors | PreparedColumns, how: Inference) -> Kernel:
-    """Return the kernel of a layer that computes ``product``.
+def operation_kernel(operation: Operation, layer: Layer, shape: Shape, how: Inference) -> Kernel:
+    """Return the kernel of a layer that applies an operation to its bottom, seen in this shape."""
+    top_shape, forward = layer.top_shapes[0], operation.forward
+    parameters = [layer.blob(j) for j in range(len(layer.blobs))]  # a detached one would count as an alias
 
-    The product overwrites its result in the next run, so the top is copied if it must last.
-    """
-    how.keeps(product.nbytes)
-    kernel = with_activation(product.forward, how.activation)
-    return (lambda *bottoms: kernel(*bottoms).clone()) if how.lasts else kernel
+    def kernel(bottom: torch.Tensor) -> torch.Tensor:
+        return in_shape(forward(in_shape(bottom, shape), *parameters), top_shape)
+
+    return with_activation(kernel, how.activation)
 
 
-def weight_and_bias(layer: Layer, how: Learning) -> tuple[tuple[torch.Tensor, torch.Tensor | None], tuple[Diff, Diff]]:
-    """Return blobs 0 and 1, and the tensors to which their gradients are added. Blob 1 may be missing."""
-    values = layer.values()
-    has_bias = len(values) > 1
-    return (values[0], values[1] if has_bias else None), (how.sums[0], how.sums[1] if has_bias else None)
+def operation_kernels(operation: Operation, layer: Layer, shapes: tuple[Shape, Shape], how: Learning) -> Kernels:
+    """Return the training kernels of a layer that applies an operation. It sees bottom and top in these ``shapes``."""
+    (shape, made_shape), parameters, sums = shapes, padded(layer.values()), padded(how.sums)
+    bottom_shape, top_shape, bottom = layer.bottom_shapes[0], layer.top_shapes[0], parameters[0]
+
+    def forward(given: torch.Tensor) -> torch.Tensor:
+        nonlocal bottom
+        bottom = in_shape(given, shape)
+        return in_shape(operation.forward(bottom, *parameters), top_shape)
+
+    def backward(diff: torch.Tensor) -> Diff:
+        found = operation.backward(in_shape(diff, made_shape), how.wanted[0], sums, bottom, *parameters)
+        return None if found is None else in_shape(found, bottom_shape)
+
+    return Kernels(forward, backward)
 
 
 class Buffer:

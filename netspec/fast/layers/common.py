@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from netspec.exact import SMALL_PRODUCT
+from netspec.exact.products import SummedProducts, VectorProducts
 from netspec.fast import fused
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Folds, blob_like, copy_of
@@ -16,12 +17,10 @@ from netspec.fast.kernels import (
     Inference,
     Kernel,
     Learning,
-    copies,
-    product_kernel,
-    weight_and_bias,
+    operation_kernel,
+    operation_kernels,
     with_activation,
 )
-from netspec.fast.products import PreparedVectors, Weights, fixed_weights
 from netspec.layers.common import Dropout, InnerProduct
 from netspec.proto.schema import TRAIN
 from netspec.run.recorded import Kernels
@@ -33,8 +32,7 @@ def _inner_product(layer: InnerProduct, how: Inference) -> Kernel | None:
     rows = math.prod(top_shape[:-1])
     one_by_one = (rows, layer.inputs)
     if layer.arithmetic(weight).is_caffes and math.prod(layer.bottom_shapes[0]):
-        learned = fixed_weights(*copies(layer.values(), how))
-        return product_kernel(PreparedVectors(layer.bottom_shapes[0], top_shape, transposed, learned), how)
+        return operation_kernel(VectorProducts(transposed), layer, one_by_one, how)
     weight = weight.t() if transposed else weight
     # A single vector is multiplied as fast as memory gives the weights, whatever their layout.
     if rows == 1:
@@ -49,40 +47,13 @@ def _inner_product(layer: InnerProduct, how: Inference) -> Kernel | None:
 
 
 def _learn_inner_product(layer: InnerProduct, how: Learning) -> Kernels | None:
-    (weight, bias), sums = weight_and_bias(layer, how)
-    transposed = layer.param.inner_product_param.transpose
-    top_shape, inputs, wanted = layer.top_shapes[0], layer.inputs, how.wanted[0]
+    top_shape, inputs = layer.top_shapes[0], layer.inputs
     if math.prod(top_shape) == 0 or inputs == 0:
         return None
-    if layer.arithmetic(weight).is_caffes:
-        product = PreparedVectors(layer.bottom_shapes[0], top_shape, transposed, Weights(weight, bias, *sums), wanted)
-        return Kernels(product.forward, product.backward)
-    tops = weight.new_empty(math.prod(top_shape[:-1]), top_shape[-1])
-    top, matrix = tops.view(top_shape), weight if transposed else weight.t()
-    diff = torch.empty(layer.bottom_shapes[0]) if wanted else None
-    vectors_diff = None if diff is None else diff.view(-1, inputs)
-    vectors = tops
-
-    def forward(data: torch.Tensor) -> torch.Tensor:
-        nonlocal vectors
-        vectors = data.reshape(-1, inputs)
-        if bias is None:
-            torch.mm(vectors, matrix, out=tops)
-        else:
-            torch.addmm(bias, vectors, matrix, out=tops)
-        return top
-
-    def backward(top_diff: torch.Tensor) -> torch.Tensor | None:
-        tops_diff = top_diff.reshape(tops.shape)
-        if sums[0] is not None:
-            sums[0].addmm_(*((vectors.t(), tops_diff) if transposed else (tops_diff.t(), vectors)))
-        if sums[1] is not None:
-            sums[1].add_(tops_diff.sum(0))
-        if vectors_diff is not None:
-            torch.mm(tops_diff, matrix.t(), out=vectors_diff)
-        return diff
-
-    return Kernels(forward, backward)
+    products = VectorProducts if layer.arithmetic(layer.blob(0)).is_caffes else SummedProducts
+    rows = math.prod(top_shape[:-1])
+    shapes = ((rows, inputs), (rows, top_shape[-1]))
+    return operation_kernels(products(layer.param.inner_product_param.transpose), layer, shapes, how)
 
 
 def _inner_product_folds(layer: InnerProduct) -> Folds:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
+from netspec.exact.channels import ChannelProducts
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Affine, Folds, blob_in_double, copy_of
-from netspec.fast.kernels import Learning
+from netspec.fast.kernels import Learning, operation_kernels
 from netspec.layers.scale import Bias, Scale
-from netspec.run.recorded import Kernels, recorded
+from netspec.run.recorded import Kernels
 
 
 def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
-    if not layer.by_channel:
+    shape = layer.bottom_shapes[0]
+    # Otherwise autograd computes the gradient of each layer from zero, before it adds those of layers that share blobs.
+    adds_at_once = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place
+    if not layer.by_channel or math.prod(shape) == 0 or not adds_at_once:
         return None
-    # Then the layer itself adds to its gradients in Caffe's order, so they are not added a second time.
-    adds_itself = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place
-    return recorded(layer.run, how.wanted, list(layer.blobs)) if adds_itself else None
+    seen = (*shape[:2], math.prod(shape[2:]))
+    return operation_kernels(ChannelProducts(), layer, (seen, seen), how)
 
 
 def _scale_folds(layer: Scale) -> Folds:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,12 +11,19 @@ import torch.nn.functional as F
 
 from netspec.exact import SMALL_PRODUCT
 from netspec.exact.layout import channels_side_by_side, in_shape, laid_out_like, map_by_map, of_one_channel
-from netspec.exact.products import Filter
+from netspec.exact.products import ColumnProducts, Filter
 from netspec.fast import fused
 from netspec.fast.entry import Entry
 from netspec.fast.folding import Absorbed, Folds, blob_like, copy_of
-from netspec.fast.kernels import Inference, Kernel, Learning, copies, product_kernel, weight_and_bias, with_activation
-from netspec.fast.products import PreparedColumns, Weights, fixed_weights
+from netspec.fast.kernels import (
+    Inference,
+    Kernel,
+    Learning,
+    operation_kernel,
+    operation_kernels,
+    padded,
+    with_activation,
+)
 from netspec.layers.vision.convolution import Convolution, Deconvolution
 from netspec.layers.vision.pooling import AVE, STOCHASTIC, Pooling
 from netspec.layers.vision.windows import CEIL, LOWEST, max_pool
@@ -37,8 +43,7 @@ def convolution(layer: Convolution, how: Inference) -> Kernel | None:
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
     weight, bias = layer.blob(0), layer.blob(1) if len(layer.blobs) > 1 else None
     if layer.arithmetic(weight).is_caffes:
-        weights = fixed_weights(*copies(layer.values(), how))
-        return product_kernel(PreparedColumns(shape, sliding, layer.group, weights), how)
+        return operation_kernel(ColumnProducts(sliding, layer.group), layer, shape, how)
     if sliding.reads_padding_alone:
         return None
     if shape[0] * layer.work > SMALL_PRODUCT and how.pack and fused.suits(weight):
@@ -52,33 +57,16 @@ def learn_convolution(layer: Convolution, how: Learning) -> Kernels | None:
     if not is_usual(layer):
         return None
     shape, sliding = layer.bottom_shapes[0], Filter(layer.kernel, layer.stride, layer.pad, layer.dilation)
-    (weight, bias), sums = weight_and_bias(layer, how)
-    weights = Weights(weight, bias, *sums)
+    weight, bias = padded(layer.values())
     if layer.arithmetic(weight).is_caffes:
-        product = PreparedColumns(shape, sliding, layer.group, weights, how.wanted[0])
-        return Kernels(product.forward, product.backward)
+        return operation_kernels(ColumnProducts(sliding, layer.group), layer, (shape, layer.top_shapes[0]), how)
     if sliding.reads_padding_alone:
         return None
     lay_out = channels_side_by_side if math.prod(shape) > 2 * weight.numel() else map_by_map
-    return _convolutions(layer, sliding, weights, how.wanted[0], lay_out)
-
-
-def _convolutions(
-    layer: Convolution,
-    sliding: Filter,
-    weights: Weights,
-    wanted: bool,
-    lay_out: Callable[[torch.Tensor], torch.Tensor],
-) -> Kernels:
-    """Return kernels with the numbers of torch's convolution and of its gradients.
-
-    ``lay_out`` returns maps in the memory layout that the kernels use.
-    """
-    weight, bias, *sums = weights
-    geometry = (sliding.stride, sliding.pad, sliding.dilation)
+    wanted, sums, geometry = how.wanted[0], padded(how.sums), (sliding.stride, sliding.pad, sliding.dilation)
     needed = (wanted, *(total is not None for total in sums))
     bias_shape = None if bias is None else list(bias.shape)
-    shape, top_shape, group = layer.bottom_shapes[0], layer.top_shapes[0], layer.group
+    top_shape, group = layer.top_shapes[0], layer.group
     gradients = torch.ops.aten.convolution_backward.default
     maps = laid_out = weight
 

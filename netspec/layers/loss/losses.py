@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 
 from netspec.exact import libm
-from netspec.exact.arithmetic import AsTorch
+from netspec.exact.pointwise import pointwise
 from netspec.layers.contract.base import Shape
 from netspec.layers.contract.registry import register
 from netspec.layers.loss.base import (
@@ -102,44 +101,12 @@ class EuclideanLoss(Loss):
         return self.arithmetic(difference).sums_of_squares(difference) / (2 * a.shape[0])
 
 
-class _Contrastive(torch.autograd.Function):
-    """The loss with Caffe's gradient, which divides by the distance + 1e-4, so that it is finite at distance 0."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        a: torch.Tensor,
-        b: torch.Tensor,
-        similar: torch.Tensor,
-        margin: float,
-        legacy: bool,
-        arithmetic: AsTorch,
-    ) -> torch.Tensor:
-        difference = a - b
-        squared = arithmetic.sums_of_squares(difference, 1)
-        distance = libm.sqrt(squared)
-        dissimilar = (margin - squared).clamp(min=0) if legacy else (margin - distance).clamp(min=0).square()
-        ctx.save_for_backward(difference, squared if legacy else distance, similar)
-        ctx.margin, ctx.legacy = margin, legacy
-        losses = torch.where(similar, squared, dissimilar)
-        return arithmetic.total(losses) / len(a) / 2
-
-    @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        difference, distance, similar = ctx.saved_tensors
-        alpha = grads[0] / len(difference)
-        lacking = ctx.margin - distance
-        dissimilar = -alpha if ctx.legacy else -alpha * lacking / (distance + 1e-4)
-        factor = torch.where(similar, alpha, dissimilar.where(lacking > 0, 0))
-        grad = factor.unsqueeze(1) * difference
-        return grad, -grad, None, None, None, None
-
-
 @register("ContrastiveLoss", "contrastive_loss_param")
 class ContrastiveLoss(Loss):
     """The sum of d^2 over similar pairs and of max(margin - d, 0)^2 over the others, / (2 N); d = |a - b|.
 
-    With legacy_version, dissimilar pairs have max(margin - d^2, 0).
+    With legacy_version, dissimilar pairs have max(margin - d^2, 0). As in Caffe, the gradient divides by d + 1e-4, so
+    that it is finite at distance 0.
 
     bottom[0]  a (N, C) or (N, C, 1, 1)
     bottom[1]  b, the same shape
@@ -164,7 +131,25 @@ class ContrastiveLoss(Loss):
         return shapes
 
     def forward(self, a: torch.Tensor, b: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
-        p = self.param.contrastive_loss_param
+        margin, legacy = self.param.contrastive_loss_param.margin, self.param.contrastive_loss_param.legacy_version
         similar = label.reshape(-1).long() != 0
         arithmetic = self.arithmetic(a, small=True)
-        return _Contrastive.apply(a.flatten(1), b.flatten(1), similar, p.margin, p.legacy_version, arithmetic)
+
+        def measured(difference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            """Return d^2, and what the margin is compared with."""
+            squared = arithmetic.sums_of_squares(difference, 1)
+            return squared, squared if legacy else libm.sqrt(squared)
+
+        def compute(difference: torch.Tensor) -> torch.Tensor:
+            squared, distance = measured(difference)
+            lacking = (margin - distance).clamp(min=0)
+            losses = torch.where(similar, squared, lacking if legacy else lacking.square())
+            return arithmetic.total(losses) / len(losses) / 2
+
+        def gradient(difference: torch.Tensor, _: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
+            alpha, (_, distance) = diff / len(difference), measured(difference)
+            lacking = margin - distance
+            dissimilar = -alpha if legacy else -alpha * lacking / (distance + 1e-4)
+            return torch.where(similar, alpha, dissimilar.where(lacking > 0, 0)).unsqueeze(1) * difference
+
+        return pointwise(a.flatten(1) - b.flatten(1), compute, gradient)
