@@ -1,4 +1,4 @@
-"""The files of a benchmark case, which all programs read: net, weights, inputs and records."""
+"""The files of a benchmark case, which all programs read: net, weights, ONNX model, inputs and records."""
 
 from __future__ import annotations
 
@@ -45,6 +45,11 @@ class Case:
         return self.folder / "net.py"
 
     @property
+    def onnx(self) -> Path:
+        """The ONNX model that ``netspec export --to onnx`` wrote."""
+        return self.folder / "net.onnx"
+
+    @property
     def inputs(self) -> Path:
         """An .npz file with the inputs by blob, or with a batch of records and labels for training."""
         return self.folder / "inputs.npz"
@@ -56,12 +61,13 @@ class Case:
 
 
 @contextmanager
-def forward_case(name: str, batch: int, weights: str | None = None) -> Iterator[Case]:
+def forward_case(name: str, batch: int, weights: str | None = None, onnx: bool = True) -> Iterator[Case]:
     """Write the files for forward passes of a net; ``name`` is in the catalog, or the path of a prototxt.
 
     Without ``weights``, random weights are written. Raises SpecError for faults in the files.
     """
     import netspec
+    from netspec.export.formats.onnx import export_onnx
     from netspec.proto.text import write_text
 
     with TemporaryDirectory(prefix="bench-") as folder:
@@ -76,6 +82,8 @@ def forward_case(name: str, batch: int, weights: str | None = None) -> Iterator[
             calm(net, inputs)
         netspec.save_weights(net, case.caffemodel)
         write_torch(net, case.torch)
+        if onnx:
+            export_onnx(net, case.onnx)
         np.savez(case.inputs, allow_pickle=False, **inputs)
         yield case
 
@@ -153,7 +161,7 @@ def training_net(name: str, source: str, batch: int) -> Any:
 def record(name: str) -> tuple[tuple[int, int, int], int]:
     """Return the shape of a net's records, and the number of labels."""
     if name in ZOO:
-        return ZOO[name][1], 2 if name in ("pnet", "onet") else 10
+        return ZOO[name][1], 2 if name in ("pnet", "rnet", "onet") else 10
     size = 64 if name in SMALL else 224
     return (6, size, size), 2
 

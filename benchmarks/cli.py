@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import logging
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netspec.terminal.commands import run
+from benchmarks.report import Row
+from netspec.terminal.commands import WrongUsage, run
 from netspec.terminal.parser import Commands, Parser
 
 ENGINES = ("netspec", "netspec-onnxruntime", "netspec-openvino", "netspec-openvino-bf16")
-FORWARD = (*ENGINES, "pytorch", "opencv4")
-TRAINING = ("netspec", "netspec-bf16", "pytorch", "pytorch-bf16")
+FORWARD = (*ENGINES, "pytorch", "opencv4", "onnxruntime", "openvino", "openvino-bf16", "pycaffe")
+WHOLE = ("mtcnn", "ssd300", "files", "classifier", "training", "start")
+TRAINING = ("netspec", "netspec-bf16", "pycaffe", "pytorch", "pytorch-bf16")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,6 +34,7 @@ def parser() -> Parser:
     commands = Commands(made, log_level=logging.WARNING)
     _add_forward(commands)
     _add_train(commands)
+    _add_whole(commands)
     _add_growth(commands)
     _add_revisits(commands)
     _add_tables(commands)
@@ -137,13 +139,17 @@ def _add_forward(commands: Commands) -> None:
     parser = commands.add_parser("forward", _forward, help="compare the time of forward passes with other programs")
     parser.add_argument("nets", nargs="+", metavar="NET", help="a net of the catalog (see list), or a prototxt")
     parser.add_argument("--weights", help="a .caffemodel for the prototxt (default: random weights)")
-    _add_common(parser, FORWARD, FORWARD)
+    _add_common(parser, FORWARD, (*ENGINES, "pytorch", "opencv4"))
 
 
 def _forward(arguments: argparse.Namespace) -> None:
     from benchmarks.case import forward_case
 
-    _compare(arguments, partial(forward_case, weights=arguments.weights), training=False)
+    def case(name: str, batch: int) -> Any:
+        needs_onnx = any(program.startswith(("onnxruntime", "openvino")) for program in arguments.programs)
+        return forward_case(name, batch, arguments.weights, needs_onnx)
+
+    _compare(arguments, case, training=False)
 
 
 def _add_train(commands: Commands) -> None:
@@ -156,6 +162,8 @@ def _add_train(commands: Commands) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from benchmarks.case import training_case
 
+    if arguments.device != "cpu" and "pycaffe" in arguments.programs:
+        raise WrongUsage("only netspec and pytorch can be timed on a device other than the CPU")
     _compare(arguments, training_case, training=True, device=arguments.device)
 
 
@@ -180,26 +188,54 @@ def _keep(arguments: argparse.Namespace, rows: Sequence[Any], described: Any = N
         results.write(arguments.json, rows, arguments.words, described)
 
 
+def _add_whole(commands: Commands) -> None:
+    parser = commands.add_parser("programs", _whole, help="time whole programs: detectors, files, a training, a start")
+    parser.set_defaults(programs=["opencv4"])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"programs to time: {', '.join(WHOLE)} (default: all)")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads (default: 1 2)")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds (default: 3)")
+    _add_json(parser)
+
+
+def _whole(arguments: argparse.Namespace) -> None:
+    from benchmarks.whole import How, measure
+
+    def rows(separate_python: str | None) -> Iterator[list[Row]]:
+        return measure(arguments.names or WHOLE, How(arguments.threads, arguments.rounds, separate_python))
+
+    _report(arguments, rows)
+
+
 def _compare(
     arguments: argparse.Namespace,
     case_of: Callable[[str, int], Any],
     training: bool,
     device: str = "cpu",
 ) -> None:
-    """Print a table for each case, and the programs that could not run; write all rows."""
-    from benchmarks import environment, report, results
-    from benchmarks.compare import SEPARATE, Comparison, rows_of
+    from benchmarks.compare import Comparison, rows_of
 
-    separate_python = environment.python() if SEPARATE in arguments.programs else None
+    def rows(separate_python: str | None) -> Iterator[list[Row]]:
+        how = Comparison(arguments.programs, training, arguments.rounds, separate_python, arguments.seconds, device)
+        for name in arguments.nets:
+            for batch in arguments.batch:
+                with case_of(name, batch) as case:
+                    for threads in arguments.threads:
+                        yield rows_of(case, threads, how)
+
+    _report(arguments, rows)
+
+
+def _report(arguments: argparse.Namespace, rows_of: Callable[[str | None], Iterator[list[Row]]]) -> None:
+    """Print a table for each list of rows, and the programs that could not run; write all rows."""
+    from benchmarks import environment, report, results
+    from benchmarks.compare import IN_SEPARATE_ENVIRONMENT
+
+    separate_python = environment.python() if set(arguments.programs) & set(IN_SEPARATE_ENVIRONMENT) else None
     described, rows = results.machine(separate_python), []
-    how = Comparison(arguments.programs, training, arguments.rounds, separate_python, arguments.seconds, device)
-    for name, batch in itertools.product(arguments.nets, arguments.batch):
-        with case_of(name, batch) as case:
-            for threads in arguments.threads:
-                found = rows_of(case, threads, how)
-                rows += found
-                print(report.table(found), flush=True)
-                for row in found:
-                    if row.fault:
-                        print(f"{row.name}: {row.fault}", file=sys.stderr)
-                _keep(arguments, [report.columns(row) for row in rows], described)
+    for found in rows_of(separate_python):
+        rows += found
+        print(report.table(found), flush=True)
+        for row in found:
+            if row.fault:
+                print(f"{row.name}: {row.fault}", file=sys.stderr)
+        _keep(arguments, [report.columns(row) for row in rows], described)

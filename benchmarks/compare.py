@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from benchmarks.case import DECAY, MOMENTUM, RATE, Case
 from benchmarks.report import REFERENCES, Row
 from benchmarks.rounds import Contestant, Pass, Worker, difference, measure, ratio
 
-SEPARATE = "opencv4"  # the program that needs a separate environment
+IN_SEPARATE_ENVIRONMENT = ("opencv4", "onnxruntime", "openvino", "openvino-bf16")
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Comparison:
 
     programs         the programs and engines to compare, such as netspec-onnxruntime
     training         whether a pass is a training iteration, and not a forward pass
-    separate_python  the Python of a separate environment, for the program that needs it
+    separate_python  the Python of a separate environment, for the programs that need it
     limit            the rounds take at most this many seconds, but there are at least three
     device           the torch device for trainings by netspec and by PyTorch alone
     """
@@ -46,7 +46,14 @@ def rows_of(case: Case, threads: int, how: Comparison) -> list[Row]:
         for one in contestants:
             one.close()
     _show_progress(case, threads, how.rounds, how.rounds)
-    what = "training" if how.training else "forward"
+    return rows_of_times(case, threads, contestants, times, "training" if how.training else "forward")
+
+
+def rows_of_times(
+    case: Case, threads: int, contestants: Sequence[Contestant], times: Mapping[str, Sequence[Pass]], what: str
+) -> list[Row]:
+    """Return a row for each contestant; ``times``: those that were measured, by name."""
+    able = [one for one in contestants if not one.fault]
     expected = next((one.outputs for one in able if one.name == "netspec"), None)
     seconds = {name: [clock for clock, _ in passes] for name, passes in times.items()}
     rows = []
@@ -73,7 +80,8 @@ def task_of(case: Case, threads: int) -> dict[str, Any]:
     outputs = sorted({blob for layer in message.layer for blob in layer.top} - read)
     return {
         **{
-            name: str(getattr(case, name)) for name in ("prototxt", "caffemodel", "torch", "inputs", "solver", "folder")
+            name: str(getattr(case, name))
+            for name in ("prototxt", "caffemodel", "torch", "onnx", "inputs", "solver", "folder")
         },
         "cache": str(case.folder / "cache"),
         **{"outputs": outputs, "threads": threads, "device": "cpu"},
@@ -85,8 +93,7 @@ def _worker(case: Case, program: str, task: dict[str, Any], suffix: str, separat
     name, options = parts(program)
     if name == "pytorch" and not case.torch.is_file():
         return _Absent(program, "netspec export --to torch cannot write this net")
-    python = separate_python if separate_python and program == SEPARATE else sys.executable
-    return Worker(program, python, {**task, **options, "program": name + suffix})
+    return Worker(program, python_of(program, separate_python), {**task, **options, "program": name + suffix})
 
 
 def parts(program: str) -> tuple[str, dict[str, str]]:
@@ -94,6 +101,11 @@ def parts(program: str) -> tuple[str, dict[str, str]]:
     name, *rest = program.split("-")
     precision = rest.pop() if rest[-1:] == ["bf16"] else "fp32"
     return name, {"engine": rest[0] if rest else "torch", "precision": precision}
+
+
+def python_of(program: str, separate_python: str | None) -> str:
+    """Return the path of the Python that has the library that a program needs."""
+    return separate_python if separate_python and program in IN_SEPARATE_ENVIRONMENT else sys.executable
 
 
 class _Absent:

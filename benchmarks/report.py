@@ -17,7 +17,7 @@ class Row:
 
     ``seconds`` (wall clock) and ``computing`` (CPU time of all threads) are times of a pass, one per round. ``ratios``
     and ``spent`` are their ratios to the references. ``peak`` is the peak memory of the process in MB. ``what`` was
-    timed: "forward" or "training".
+    timed: "forward", "training" or "program".
     """
 
     net: str

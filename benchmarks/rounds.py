@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, Protocol
 
 import numpy as np
@@ -47,13 +48,21 @@ class Contestant(Protocol):
 
 
 class Worker:
-    """A process of benchmarks/worker.py, with the Python that has its library."""
+    """A process of benchmarks/worker.py, or of another module like it, with the Python that has its library."""
 
-    def __init__(self, name: str, python: str, task: Mapping[str, Any]):
+    def __init__(
+        self,
+        name: str,
+        python: str,
+        task: Mapping[str, Any],
+        variables: Mapping[str, str | None] | None = None,
+        module: str = "benchmarks.worker",
+    ):
         self.name = name
-        result = Path(task["folder"]) / f"{name}.npz"
-        command = [python, "-m", "benchmarks.worker", json.dumps({**task, "result": str(result)})]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        result = Path(task["folder"]) / f"{name.replace('/', '_')}.npz"
+        command = [python, "-m", module, json.dumps({**task, "result": str(result)})]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), **(variables or {})}
+        environment = {key: value for key, value in environment.items() if value is not None}
         self.errors = result.with_suffix(".log").open("w+")
         self.process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, text=True
@@ -96,6 +105,35 @@ def _peak(process: int) -> float | None:
     path = Path(f"/proc/{process}/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", path.read_text()) if path.is_file() else None
     return int(found[1]) / 1e3 * 1.024 if found else None
+
+
+class Command:
+    """A whole process, started again for each pass; the times are those from its start to its end."""
+
+    peak: float | None = None
+
+    def __init__(self, name: str, words: Sequence[str], variables: Mapping[str, str]) -> None:
+        self.name, self.fault, self.outputs = name, "", {}
+        self._words, self._variables = list(words), {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+
+    def turn(self, passes: int) -> list[Pass]:
+        """See :class:`Contestant`."""
+        return [self._run() for _ in range(passes)]
+
+    def _run(self) -> Pass:
+        with TemporaryFile("w+") as errors:
+            began = time.perf_counter()
+            process = subprocess.Popen(self._words, env=self._variables, stdout=errors, stderr=errors)
+            _, status, used = os.wait4(process.pid, 0)
+            seconds = time.perf_counter() - began
+            process.returncode = os.waitstatus_to_exitcode(status)
+            if process.returncode:
+                errors.seek(0)
+                raise SpecError(f"{self.name}: {(errors.read().strip().splitlines() or ['it failed'])[-1]}")
+        return seconds, used.ru_utime + used.ru_stime
+
+    def close(self) -> None:
+        """See :class:`Contestant`."""
 
 
 def measure(

@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
@@ -39,6 +39,19 @@ def netspec(task: Task) -> Run:
             return net(**inputs)
 
     return run
+
+
+def pycaffe(task: Task) -> Run:
+    """Run netspec's pycaffe."""
+    os.environ.setdefault("GLOG_minloglevel", "2")
+    caffe = import_module("netspec.pycaffe")
+    import torch
+
+    torch.set_num_threads(task["threads"])
+    net = caffe.Net(task["prototxt"], task["caffemodel"], caffe.TEST)
+    for name, value in _inputs(task).items():
+        net.blobs[name].data[...] = value
+    return net.forward
 
 
 def pytorch(task: Task) -> Run:
@@ -97,6 +110,42 @@ def opencv4(task: Task) -> Run:
     return run
 
 
+def onnxruntime(task: Task) -> Run:
+    """Run the exported model in onnxruntime directly."""
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # it would look up a host
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = task["threads"]
+    options.log_severity_level = 3
+    session = ort.InferenceSession(task["onnx"], options, providers=["CPUExecutionProvider"])
+    inputs, outputs = _inputs(task), task["outputs"]
+    return lambda: dict(zip(outputs, session.run(outputs, inputs), strict=True))
+
+
+def openvino(task: Task) -> Run:
+    """Run the exported model in OpenVINO directly, in the precision of the task."""
+    sys.modules["openvino_telemetry"] = None  # type: ignore[assignment]  # it would look up a host
+    import openvino
+
+    core = openvino.Core()
+    model = core.read_model(task["onnx"])
+    inputs, outputs = _inputs(task), task["outputs"]
+    model.reshape({name: list(value.shape) for name, value in inputs.items()})
+    settings = {
+        "INFERENCE_PRECISION_HINT": {"fp32": "f32", "bf16": "bf16"}[task.get("precision", "fp32")],
+        "INFERENCE_NUM_THREADS": task["threads"],
+        "PERFORMANCE_HINT": "LATENCY",
+    }
+    request = core.compile_model(model, "CPU", settings).create_infer_request()
+
+    def run() -> dict[str, Any]:
+        found = request.infer(inputs)
+        return {name: found[name] for name in outputs}
+
+    return run
+
+
 def netspec_training(task: Task) -> Run:
     """Train as ``netspec train`` does: its data layer, its solver."""
     import_module("netspec.terminal.process").set_up()  # before torch: it sets how OpenMP's threads wait
@@ -115,6 +164,23 @@ def netspec_training(task: Task) -> Run:
         solver.step(1)
         _finish(task)
         return {"loss": solver.loss}
+
+    return run
+
+
+def pycaffe_training(task: Task) -> Run:
+    """Train with the solver of netspec's pycaffe."""
+    os.environ.setdefault("GLOG_minloglevel", "2")
+    caffe = import_module("netspec.pycaffe")
+    import torch
+
+    torch.set_num_threads(task["threads"])
+    solver = caffe.get_solver(task["solver"])
+    solver.net.copy_from(task["caffemodel"])
+
+    def run() -> dict[str, Any]:
+        solver.step(1)
+        return {"loss": solver.net.blobs["loss"].data.copy()}
 
     return run
 
@@ -144,7 +210,18 @@ def pytorch_training(task: Task) -> Run:
 
 
 PROGRAMS: dict[str, Callable[[Task], Run]] = {
-    program.__name__: program for program in (netspec, pytorch, opencv4, netspec_training, pytorch_training)
+    program.__name__: program
+    for program in (
+        netspec,
+        pycaffe,
+        pytorch,
+        opencv4,
+        onnxruntime,
+        openvino,
+        netspec_training,
+        pycaffe_training,
+        pytorch_training,
+    )
 }
 
 
@@ -161,13 +238,13 @@ def _inputs(task: Task) -> dict[str, np.ndarray]:
         return {name: arrays[name] for name in arrays.files}
 
 
-def main() -> None:
+def main(programs: Mapping[str, Callable[[Task], Run]] = PROGRAMS) -> None:
     """Answer requests until stdin ends."""
     task = json.loads(sys.argv[1])
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # output of libraries goes to stderr
     try:
-        run = PROGRAMS[task["program"]](task)
+        run = programs[task["program"]](task)
         np.savez(task["result"], allow_pickle=False, **{name: np.array(value) for name, value in run().items()})
     except Exception as fault:
         print(json.dumps({"fault": f"{type(fault).__name__}: {' '.join(str(fault).split())}"}), file=answers)

@@ -22,12 +22,27 @@ def lenet(n: Any) -> str:
     return _full(n, "ip2", relu(n, "relu1", _full(n, "ip1", top, 500)), 10)
 
 
+def tiny(n: Any) -> str:
+    """Three layers of at most 20 numbers, as in reinforcement learning and tutorials."""
+    top = relu(n, "relu1", _full(n, "ip1", "data", 20))
+    top = add(n, "TanH", "tanh2", _full(n, "ip2", top, 20))
+    return _full(n, "ip3", top, 10)
+
+
 def pnet(n: Any) -> str:
     """Zhang et al. 2016, MTCNN: the first net, on one window; whether it shows a face."""
     top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 10, 3)), 2)
     top = _prelu(n, "prelu2", conv(n, "conv2", top, 16, 3))
     top = _prelu(n, "prelu3", conv(n, "conv3", top, 32, 3))
     return conv(n, "conv4", top, 2, 1)
+
+
+def rnet(n: Any) -> str:
+    """MTCNN's second net, on one window; whether it shows a face."""
+    top = pool(n, "pool1", _prelu(n, "prelu1", conv(n, "conv1", "data", 28, 3)), 3)
+    top = pool(n, "pool2", _prelu(n, "prelu2", conv(n, "conv2", top, 48, 3)), 3)
+    top = _prelu(n, "prelu4", _full(n, "conv4", _prelu(n, "prelu3", conv(n, "conv3", top, 64, 2)), 128))
+    return _full(n, "conv5-1", top, 2)
 
 
 def onet(n: Any) -> str:
@@ -121,7 +136,9 @@ def squeezenet(n: Any) -> str:
 SQUEEZENET = ((16, 64), (16, 64), (32, 128), (32, 128), (48, 192), (48, 192), (64, 256), (64, 256))
 
 ZOO: dict[str, tuple[Callable[[Any], str], tuple[int, int, int]]] = {  # the layers, and the image (C, H, W)
+    "tiny": (tiny, (10, 1, 1)),
     "pnet": (pnet, (3, 12, 12)),
+    "rnet": (rnet, (3, 24, 24)),
     "onet": (onet, (3, 48, 48)),
     "lenet": (lenet, (1, 28, 28)),
     "cifar10_quick": (cifar10_quick, (3, 32, 32)),

@@ -1,6 +1,7 @@
 """tools/bench: its rounds, its tables, its words for what cannot run."""
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import case
-from benchmarks.cli import main
+import netspec
+from benchmarks import case, environment, whole
+from benchmarks.cli import WHOLE, main
+from benchmarks.detectors import ssd300
 from benchmarks.report import Row, table
 from benchmarks.rounds import difference, measure, ratio
 
@@ -87,11 +90,11 @@ def test_a_table_has_the_ratios_of_what_ran_and_a_line_for_what_did_not() -> Non
 @pytest.mark.slow
 def test_forward_passes_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lenet.json"
-    ways = ["--with", "netspec", "pytorch"]
+    ways = ["--with", "netspec", "pytorch", "pycaffe"]
     assert main(["forward", "lenet", *ways, "--rounds", "1", "--json", str(out)]) == 0
     assert "| lenet | 1 | 1 | pytorch |" in capsys.readouterr().out
     written = json.loads(out.read_text())
-    assert [row["run by"] for row in written["rows"]] == ["netspec", "pytorch"]
+    assert [row["run by"] for row in written["rows"]] == ["netspec", "pytorch", "pycaffe"]
     assert all(row["what"] == "forward" and row["ms"] > 0 for row in written["rows"])
     assert written["rows"][1]["off by"] < 1e-5
     assert written["machine"]["cores"] > 0
@@ -133,3 +136,36 @@ def test_growth_is_measured_and_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert [row["frames"] for row in rows] == [12, 22]
     assert all(value >= 0 for row in rows for value in row.values())
     assert all(row["memory, MB"] > 10 for row in rows)
+
+
+@pytest.mark.slow
+def test_whole_programs_are_compared(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without OpenCV 4, which has an environment of its own."""
+    peers = {"mtcnn": ("netspec", "pytorch"), "training": ("netspec",)}
+    monkeypatch.setattr(whole, "PEERS", peers)
+    monkeypatch.setattr(whole, "ITERATIONS", 2)
+    monkeypatch.setattr(environment, "python", lambda: sys.executable)
+    out = tmp_path / "programs.json"
+    assert main(["programs", *peers, "--threads", "1", "--rounds", "1", "--json", str(out)]) == 0
+    assert "| mtcnn | 1 | 1 | netspec |" in capsys.readouterr().out
+    rows = json.loads(out.read_text())["rows"]
+    assert [(row["net"], row["run by"]) for row in rows] == [(name, peer) for name in peers for peer in peers[name]]
+    assert all(row["what"] == "program" and row["CPU ms"] > 0 for row in rows)
+    assert rows[1]["off by"] < 1e-4
+
+
+def test_an_unknown_program_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(environment, "python", lambda: sys.executable)
+    assert tuple(whole.PEERS) == WHOLE
+    assert main(["programs", "yolo"]) == 1
+    assert 'no program "yolo"; there are: mtcnn, ssd300' in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_prototxt_of_ssd300_has_8732_priors(tmp_path: Path) -> None:
+    (tmp_path / "ssd300.prototxt").write_text(ssd300())
+    net = netspec.load_net(tmp_path / "ssd300.prototxt")
+    assert net.shapes["loc"] == (1, 4 * 8732)
+    assert net.shapes["detections"] == (1, 1, 1, 7)

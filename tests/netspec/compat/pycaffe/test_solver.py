@@ -208,7 +208,7 @@ def test_debug_info_equals_that_of_netspecs_solver(write: Callable[..., str], ca
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["sgd_step", "sgd_iter_size", "adam", "lenet", "cifar10_quick", "pnet"])
+@pytest.mark.parametrize("case", ["sgd_step", "sgd_iter_size", "adam", "tiny", "lenet", "cifar10_quick", "pnet"])
 def test_the_weights_are_those_of_netspecs_solver(
     case: str, work_in: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
