@@ -6,6 +6,7 @@ If two forks have different layers with the same type (BN, Upsample), the given 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -267,7 +268,7 @@ class DeephiResize(Layer):
         self.settings = p = value(self.param, "deephi_resize_param")
         self.nearest = p.resize_type == p.NEAREST
         pairs = ("new_height", "new_width"), ("scale_h", "scale_w")
-        if not any(all(getattr(p, name) > 0 for name in pair) for pair in pairs):
+        if not any(all(0 < getattr(p, name) < math.inf for name in pair) for pair in pairs):
             raise self.error(
                 "expected new_height and new_width, or scale_h and scale_w, above 0", "deephi_resize_param"
             )

@@ -74,8 +74,10 @@ class Convolution(convolution.Convolution):
         if holes and (param.dilation or holes not in (["hole"], ["hole_h", "hole_w"])):
             message = f"expected dilation, or hole, or both hole_h and hole_w; found {' and '.join(holes)}"
             raise self.error(message + (" and dilation" if param.dilation else ""), GROUP, holes[0])
+        if len(holes) == 2 and self.spatial_axes != 2:
+            raise self.error(f"hole_h is for 2 spatial axes, found {self.spatial_axes}; use hole", GROUP, "hole_h")
         if holes:
-            self.dilation = tuple(value(param, name) for name in holes * (self.spatial_axes // len(holes)))
+            self.dilation = tuple(value(param, name) for name in (holes * self.spatial_axes)[: self.spatial_axes])
             if min(self.dilation, default=1) < 1:
                 raise self.error(f"{holes[0]} must be at least 1", GROUP, holes[0])
         self.sides = [value(param, name) for name in SIDES]
@@ -147,7 +149,7 @@ class Pooling(pooling.Pooling):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of the top; the pad of each side must be less than the kernel."""
         shape, param = bottom_shapes[0], self.param.pooling_param
-        if len(shape) != 4:
+        if len(shape) != 4 or min(shape) < 1:
             raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
         self.kernel = (shape[2], shape[3]) if param.global_pooling else self.kernel
         counts, self.frame, self.lengths = [], [], []
@@ -157,8 +159,9 @@ class Pooling(pooling.Pooling):
             free = size + before + after - kernel
             count = (free // stride if param.round_mode == windows.FLOOR else -(-free // stride)) + 1
             count -= any(map(any, self.sides)) and (count - 1) * stride >= size + before
-            if count < 1:
-                raise self.error(f"no window of {kernel} at stride {stride} fits {size} pixels", POOLING)
+            if count < 1 or (count - 1) * stride - before >= size:
+                fault = f"no window of {kernel} at stride {stride} fits {size} pixels, or one lies outside"
+                raise self.error(fault, POOLING)
             counts.append(count)
             self.frame = [before, (count - 1) * stride + kernel - before - size, *self.frame]
             starts = [i * stride - before for i in range(count)]

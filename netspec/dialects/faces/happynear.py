@@ -175,7 +175,7 @@ class LabelSpecificAdd(Layer):
                     bias = p.bias_base + float(np.float64(1 + p.bias_gamma * self.passes) ** p.bias_power) - 1
                 self.bias = min(max(bias, p.bias_min), p.bias_max)
                 self.passes += 1
-            flat, labels = scores.detach().flatten(1), labels.reshape(-1, 1).long()
+            flat, labels = scores.detach()[..., None].flatten(1), labels.reshape(-1, 1).long()
             if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) < flat.shape[1]:
                 raise self.error(f"found a label outside 0 to {flat.shape[1] - 1}", "bottom", 1)
             added = torch.where(flat.gather(1, labels) > -self.bias, self.bias, 0.0)

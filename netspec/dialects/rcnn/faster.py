@@ -128,6 +128,8 @@ class AnchorTarget(_Sampling):
             raise self.error(f"found scores of shape {bottom_shapes[0]}, expected (1, C, H, W)", "bottom", 0)
         if bottom_shapes[1][1:] not in ((4,), (5,), (5 + ATTRIBUTES,)):
             raise self.error(f"found true boxes of shape {bottom_shapes[1]}, expected (n, 5)", "bottom", 1)
+        if math.prod(bottom_shapes[2]) < 2:
+            raise self.error(f"found an image's sizes of shape {bottom_shapes[2]}, expected (1, 3)", "bottom", 2)
         count, (height, width) = len(self.anchors), bottom_shapes[0][2:]
         return [(1, 1, count * height, width), *[(1, 4 * count, height, width)] * 3]
 

@@ -92,9 +92,9 @@ class SmoothL1Loss(Loss):
         losses = F.smooth_l1_loss(weighted, torch.zeros_like(weighted), reduction="none", beta=self.knee)
         if not self.by_pixel:
             return (losses if outside is None else losses * outside).sum() / len(predictions)
-        items, _, *pixels = four(tuple(losses.shape))
+        items, channels, *pixels = four(tuple(losses.shape))
         loss = losses.sum() / divisor(self, items, math.prod(pixels), None)
-        each = losses.detach().reshape(items, losses.shape[1], *pixels).sum(1, keepdim=True)
+        each = losses.detach().reshape(items, channels, *pixels).sum(1, keepdim=True)
         return (loss, each) if self.num_tops > 1 else loss
 
 

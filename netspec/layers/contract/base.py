@@ -351,8 +351,8 @@ class Layer(torch.nn.Module):
             raise self.error(f"found shape {tuple(shape)}, expected no negative size")
         if len(shape) > MOST_AXES:
             raise self.error(f"found a blob of {len(shape):,} axes, expected at most {MOST_AXES}")
-        if math.prod(shape) > MOST:
-            raise self.error(f"found shape {tuple(shape)}, {math.prod(shape):,} numbers, expected at most {MOST:,}")
+        if (numbers := max((math.prod(shape), *shape))) > MOST:  # also along one axis, if another is empty
+            raise self.error(f"found shape {tuple(shape)}, {numbers:,} numbers, expected at most {MOST:,}")
         return tuple(shape)
 
     def _reshaped(self, bottom_shapes: list[Shape]) -> list[Shape]:

@@ -72,3 +72,23 @@ def test_invalid_fields_and_bottoms_are_refused_at_their_place(case: dict[str, s
     fault = caught.value
     assert (fault.where.file if fault.where else "") == case["field"]
     assert len(str(fault).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("dialect", "line"),
+    [
+        ("rfcn", "type: 'SmoothL1LossOHEM' top: 'a' top: 'b'"),
+        ("happynear", "type: 'LabelSpecificAdd' label_specific_add_param { bias: -0.5 }"),
+    ],
+    ids=["SmoothL1LossOHEM", "LabelSpecificAdd"],
+)
+def test_a_bottom_of_one_axis_has_one_channel(dialect: str, line: str) -> None:
+    use_dialect(dialect)
+    scores, other = torch.tensor([0.5, -2.0, 1.0]), torch.zeros(3)
+    shapes = [((3,), (3,)), ((3, 1), (3, 1))]
+    tops = [
+        make_layer(line, each, Context(TRAIN), line.count("top:") or 1).run(scores.view(each[0]), other.view(each[1]))
+        for each in shapes
+    ]
+    for one, two in zip(*tops, strict=True):
+        assert torch.equal(one.flatten(), two.flatten())
