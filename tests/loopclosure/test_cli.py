@@ -84,9 +84,7 @@ def loops_in(path: Path) -> dict[int, int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "describe", [THUMBNAILS, "FEATURES", thumbnail], ids=["module:function", "features", "function"]
-)
+@pytest.mark.parametrize("describe", ["FEATURES", thumbnail], ids=["features", "function"])
 def test_detect_is_a_function_and_a_command(describe, rendered, tmp_path, capsys):
     """Both give the same loops, from the same frames; the command says how many, where the page is, what is next."""
     walk, features = rendered
@@ -160,14 +158,8 @@ def test_detect_chooses_the_threshold_automatically(tmp_path, capsys):
     assert (page.count('<div class="pair found">'), page.count('<div class="pair rejected">')) == (7, 3)
     for reason in (tmp_path / "found" / "chosen.txt").read_text().splitlines():
         assert reason in page
-    assert len(loops_in(tmp_path / "found" / "loops.csv")) > 60
-
-
-@pytest.mark.slow
-def test_loops_of_a_drive_that_cannot_be_verified_are_right(tmp_path):
-    line = ["detect", str(drive_that_comes_back(tmp_path)), "--describe", THUMBNAILS, "--out", str(tmp_path / "found")]
-    assert main(line) == 0
     loops = loops_in(tmp_path / "found" / "loops.csv")
+    assert len(loops) > 60
     assert all(abs(query - 100 - match) <= 5 for query, match in loops.items())
 
 

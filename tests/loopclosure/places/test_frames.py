@@ -14,7 +14,6 @@ from loopclosure.cli import main
 from loopclosure.errors import InputError
 from loopclosure.places.frames import (
     Selection,
-    image_paths,
     live_frames,
     read_bgr,
     video_frames,
@@ -53,37 +52,7 @@ def test_empty_selections_are_refused(selection, sentence):
         selection.numbers(10)
 
 
-def write_images(folder, names):
-    folder.mkdir(parents=True)
-    for name in names:
-        cv2.imwrite(str(folder / name), np.zeros((4, 4, 3), np.uint8))
-    return folder
-
-
-def test_folders_lists_and_sequences(tmp_path):
-    plain = write_images(tmp_path / "plain", ["10.png", "9.jpg", "1.png"])
-    (plain / "notes.txt").write_text("not an image")
-    assert [p.name for p in image_paths(plain)] == ["1.png", "9.jpg", "10.png"]
-    write_images(tmp_path / "outer" / "images", ["a.png"])
-    assert [p.name for p in image_paths(tmp_path / "outer")] == ["a.png"]
-    (tmp_path / "list.txt").write_text("# chosen\nplain/9.jpg\n12.5 plain/1.png  # twice seen\n")
-    assert [p.name for p in image_paths(tmp_path / "list.txt")] == ["9.jpg", "1.png"]
-    write_images(tmp_path / "tum" / "rgb", ["2.png", "1.png"])
-    (tmp_path / "tum" / "rgb.txt").write_text("# x\n5.0 rgb/2.png\n6.0 rgb/1.png\n")
-    assert [p.name for p in image_paths(tmp_path / "tum")] == ["2.png", "1.png"]
-
-
-def test_invalid_sources_are_refused(tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(SpecError, match="contains no images"):
-        image_paths(tmp_path / "empty")
-    (tmp_path / "list.txt").write_text("\ngone.png\n")
-    with pytest.raises(SpecError, match=r'list.txt:2:1: no such image "gone.png"'):
-        image_paths(tmp_path / "list.txt")
-    with pytest.raises(SpecError, match="cannot be read"):
-        image_paths(tmp_path / "absent.txt")
-    with pytest.raises(SpecError, match="single image"):
-        image_paths(tmp_path / "a.png")
+def test_unreadable_images_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read: No such file"):
         read_bgr(tmp_path / "a.png")
     (tmp_path / "a.png").write_text("text")

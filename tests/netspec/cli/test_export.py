@@ -106,15 +106,6 @@ def test_fold(net: Net, run: Run) -> None:
     assert_same(here(small, inputs), here(net, inputs))
 
 
-def test_a_training_net_folds_to_a_deploy_net(run: Run) -> None:
-    words = "sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel --out small --shape pair_data=2,2,28,28"
-    result = run("fold", *words.split())
-    assert result.status == 0
-    small = netspec.load_net("small.prototxt", weights="small.caffemodel")
-    assert small.inputs == ["pair_data"]
-    assert not any(layer.is_loss for layer in small.layers)
-
-
 def test_a_training_net_is_exported_with_its_loss(onnx: Any, run: Run) -> None:
     words = "export sgd_step/train_val.prototxt --weights sgd_step/init.caffemodel --to onnx --out net.onnx".split()
     assert "known only from its data; give --shape pair_data=" in run(*words).fault

@@ -187,9 +187,6 @@ def test_extract_refuses_unknown_blobs(run: Run) -> None:
     assert not Path("f.npz").exists()
 
 
-# What extract says
-
-
 # Whether the pixels are those of the training
 
 INPUT = """
@@ -230,7 +227,7 @@ def test_a_deploy_file_with_its_own_scaling_gets_no_warning(run: Run, images: Pa
 
 def test_weights_without_a_transform_get_no_warning(run: Run, images: Path) -> None:
     Path("deploy.prototxt").write_text(INPUT + CONV)
-    net = netspec.load_net("deploy.prototxt")
+    net = netspec.load_net("deploy.prototxt", seed=0)
     for weights in ("deploy.caffemodel", "deploy.caffemodel.h5"):
         netspec.save_weights(net, weights)
         assert conv1_of(run, "deploy.prototxt", weights)[1].err == ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -76,16 +75,6 @@ def test_data_returns_the_records_in_order() -> None:
     layer.close()
 
 
-@pytest.mark.parametrize("prefetch", [0, 1, 7])
-def test_batches_do_not_depend_on_prefetch(prefetch: int) -> None:
-    transform = "mirror: true crop_size: 20"
-    expected = pairs(50, "prefetch: 0", transform, phase=TRAIN, seed=3)
-    layer = pairs(50, f"prefetch: {prefetch}", transform, phase=TRAIN, seed=3)
-    for _ in range(15):
-        assert torch.equal(layer.run()[0], expected.run()[0])
-    layer.close()
-
-
 def test_restart_returns_to_the_first_record_or_to_any_iteration() -> None:
     layer = pairs(transform="mirror: true", phase=TRAIN)
     batches = [layer.run()[0] for _ in range(5)]
@@ -118,19 +107,6 @@ def test_data_logs_what_caffe_logs(caplog: pytest.LogCaptureFixture) -> None:
     assert caplog.messages == ["Restarting data prefetching from start."] * 3
     assert caplog.records[0].__dict__["site"] == "data_layer.cpp:73"
     layer.close()
-
-
-def test_prefetch_threads_start_with_the_first_batch_and_end_with_close() -> None:
-    def prefetching() -> int:
-        return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
-
-    before = prefetching()
-    layer = pairs()
-    assert prefetching() == before
-    layer.run()
-    assert prefetching() > before
-    layer.close()
-    assert prefetching() == before
 
 
 def test_data_without_a_label_top_returns_images_only() -> None:

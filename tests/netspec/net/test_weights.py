@@ -181,26 +181,6 @@ def test_layers_missing_in_the_net_are_ignored_and_logged(tmp_path: Path, caplog
     assert "Ignoring source layer ip" not in caplog.text
 
 
-def test_layers_missing_in_the_file_keep_their_values(tmp_path: Path):
-    proto = net_to_proto(net_of(TOWERS))
-    del proto.layer[1:]
-    net = net_of(TOWERS)
-    fill(net)
-    load_weights(net, written(tmp_path, proto))
-    assert blobs_of(net)["ip"][0][0].tolist() == [0, 1, 2]
-
-
-def test_blobs_of_the_old_four_axes_are_loaded(tmp_path: Path):
-    proto = NetParameter()
-    layer = proto.layer.add(name="ip")
-    layer.blobs.add(num=1, channels=1, height=4, width=3).data.extend(range(12))
-    layer.blobs.add(num=1, channels=1, height=1, width=4).data.extend([5, 6, 7, 8])
-    net = net_of(TOWERS)
-    load_weights(net, written(tmp_path, proto))
-    assert blobs_of(net)["ip"][0].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]]
-    assert blobs_of(net)["ip"][1].tolist() == [5, 6, 7, 8]
-
-
 def file_of_wide_net(kind: str) -> bytes:
     """Return a file of weights 0 to 1199 and biases 0 to 39, long enough for numbers to be read without a copy."""
     weights, biases = np.arange(1200, dtype="<f4"), np.arange(40, dtype="<f4")

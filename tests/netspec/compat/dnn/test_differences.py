@@ -37,11 +37,6 @@ def test_one_line_replaces_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
         cv2.dnn.readNet("net.unknown")
 
 
-def test_bytes_are_content() -> None:
-    with pytest.raises(dnn.DnnError, match="<prototxt>"):
-        dnn.readNetFromCaffe(str(HERE / "classify.prototxt").encode())
-
-
 def test_layers_for_training_are_left_out() -> None:
     net = made(
         'layer { name: "a" type: "Power" bottom: "data" top: "a" include { phase: TRAIN } }'

@@ -1,7 +1,6 @@
 """Net of netspec.dnn: features that OpenCV does not have, and errors for wrong use."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -165,15 +164,6 @@ def test_a_whole_pass_runs_prepared_kernels_with_the_current_parameters() -> Non
     assert np.abs(outputs[0] - outputs[1]).max() > 1e-3
 
 
-def test_inputs_are_renamed() -> None:
-    net = read("two_inputs")
-    net.setInputsNames(["left", "right"])
-    for name in ("left", "right"):
-        net.setInput(np.ones((1, 4, 6, 6)), name)
-    assert net.forward().shape == (1, 4, 6, 6)
-    assert net.getLayer(0).outputNameToIndex("right") == 1
-
-
 def test_shapes_of_one_layer() -> None:
     bottoms, tops = read("segment").getLayerShapes([1, 3, 20, 28], "conv")
     assert [tuple(shape) for shape in (*bottoms, *tops)] == [(1, 3, 20, 28), (1, 6, 10, 14)]
@@ -198,11 +188,6 @@ def test_other_names_are_those_of_cv2_dnn() -> None:
     assert {"NMSBoxes", "readNetFromCaffe"} <= set(dir(dnn))
     with pytest.raises(AttributeError, match=r"has no attribute 'readNetFromNowhere', nor has cv2.dnn of OpenCV"):
         dnn.readNetFromNowhere  # noqa: B018
-
-
-def test_a_path_object_and_a_text_path_are_the_same() -> None:
-    assert dnn.readNetFromCaffe(str(HERE / "classify.prototxt")).getLayerNames() == read("classify").getLayerNames()
-    assert isinstance(HERE, Path)
 
 
 def test_assigned_blobs_are_the_layers() -> None:
