@@ -201,7 +201,7 @@ def test_the_words_loss_is_the_softmax_loss_of_a_batchs_cosines_both_ways(
             writer.put(b"%08d" % k, array_to_datum(pixels, 1).SerializeToString())
     text = re.sub(r'source: "[^"]*"', 'source: "pairs"', (WORDS / "train_val.prototxt").read_text())
     Path("net.prototxt").write_text(text)
-    net = load_net("net.prototxt", phase="TRAIN")
+    net = load_net("net.prototxt", phase="TRAIN", seed=0)
     net.keep = "all"
     loss, _ = net.forward_loss()
     expected = 0.0

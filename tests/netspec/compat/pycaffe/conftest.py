@@ -7,6 +7,12 @@ from typing import Any
 import pytest
 
 import netspec.pycaffe as caffe
+from netspec.compat.pycaffe import mode
+
+
+@pytest.fixture(autouse=True)
+def _same_weights_in_every_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mode, "_mode", mode._Mode(seed=1))
 
 
 @pytest.fixture
