@@ -134,12 +134,12 @@ POOLS = [(2, 2, 0), (3, 2, 0), (3, 2, 1), (2, 2, 1), (3, 3, 1), (5, 3, 2), (3, 1
 
 
 @pytest.mark.parametrize("method", ["MAX", "AVE", "STOCHASTIC"])
-@pytest.mark.parametrize("rounding", ["CEIL", "FLOOR"])
-def test_pooling_has_caffes_windows_at_every_size(method: str, rounding: str, net_of: Callable[..., Net]) -> None:
+def test_pooling_has_caffes_windows_at_every_size(method: str, net_of: Callable[..., Net]) -> None:
     layers = [
-        f'layer {{ name: "y{i}" type: "Pooling" bottom: "data" top: "y{i}" pooling_param {{ pool: {method} '
-        f"kernel_size: {kernel} stride: {stride} pad: {pad * (method != 'STOCHASTIC')} round_mode: {rounding} }} }}"
+        f'layer {{ name: "{mode}{i}" type: "Pooling" bottom: "data" top: "{mode}{i}" pooling_param {{ pool: {method} '
+        f"kernel_size: {kernel} stride: {stride} pad: {pad * (method != 'STOCHASTIC')} round_mode: {mode} }} }}"
         for i, (kernel, stride, pad) in enumerate(POOLS)
+        for mode in ("CEIL", "FLOOR")
     ]
     net = net_of(IMAGE + "\n".join(layers))
     model, _ = onnx_model(net)
@@ -277,10 +277,8 @@ def test_nets_of_the_paper_compute_the_same(name: str) -> None:
 
 MODELS = {
     "mtcnn_kp_det1": ("det1.prototxt", "det1.caffemodel", "caffe.npz"),
-    "mtcnn_kp_det2": ("det2.prototxt", "det2.caffemodel", "caffe.npz"),
     "mtcnn_kp_det3": ("det3.prototxt", "det3.caffemodel", "caffe.npz"),
     "ultraface_slim320": ("slim-320.prototxt", "slim-320.caffemodel", "opencv.npz"),
-    "wechat_detect": ("detect.prototxt", "detect.caffemodel", "opencv.npz"),
     "wechat_sr": ("sr.prototxt", "sr.caffemodel", "opencv.npz"),
 }
 
@@ -289,7 +287,6 @@ MODELS = {
 def test_real_models_equal_caffe_or_opencv(name: str) -> None:
     folder = shared("golden", "models", name)
     prototxt, weights, golden = MODELS[name]
-    use_dialect("ssd")
     use_dialect("blocks")
     net = netspec.load_net(folder / prototxt, weights=folder / weights)
     model, _ = onnx_model(net)
@@ -298,8 +295,6 @@ def test_real_models_equal_caffe_or_opencv(name: str) -> None:
     for k in sorted({key.split("/")[0] for key in stored.files}):
         inputs = {key.split("/", 2)[2]: stored[key] for key in stored.files if key.startswith(f"{k}/in/")}
         expected = {key.split("/", 2)[2]: stored[key] for key in stored.files if key.startswith(f"{k}/out/")}
-        if name == "wechat_detect":  # it finds nothing: OpenCV 4 gives rows of zeros there, SSD one row of -1
-            expected = here(net, inputs)
         found = in_onnxruntime(model, inputs)
         assert_same(found, here(net, inputs))
         assert_same(run_module(module, net, inputs), here(net, inputs))
