@@ -134,8 +134,14 @@ def data_set(
     if references is not None:
         return datasets.load_traverses(source.path, references, tolerance or 0, chosen, truth)
     if kind == "fabmap":
-        camera, files = source.get("camera", str) or "both", datasets.FabmapFiles(truth, source.get("coordinates", str))
-        return datasets.load_fabmap(source.path, files, camera, chosen, exclusion or datasets.FABMAP_EXCLUSION)
+        return datasets.load_fabmap(
+            source.path,
+            source.get("camera", str) or "both",
+            chosen,
+            exclusion or datasets.FABMAP_EXCLUSION,
+            truth_file=truth,
+            coordinates=source.get("coordinates", str),
+        )
     if kind == "images":
         assert truth is not None
         return datasets.load_folder(source.path, truth, chosen, exclusion or datasets.FOLDER_EXCLUSION)

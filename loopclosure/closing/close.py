@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,10 +58,6 @@ class Closed:
     no_path: int = 0
     gaps: int = 0
 
-    def count(self, kind: str) -> int:
-        """Return the number of loops of this ``Relative.kind``."""
-        return sum(loop.relative is not None and loop.relative.kind == kind for loop in self.loops)
-
     def errors(self) -> dict[str, tuple[float, float]] | None:
         """Return the errors before and after, by name and unit; None without at least three true poses."""
         if self.truth is None:
@@ -69,17 +65,9 @@ class Closed:
         known = np.all(np.isfinite(self.truth), axis=1)
         if np.count_nonzero(known) < 3:
             return None
-        paths = self.odometry[known], self.poses[known]
-        return {
-            "position, ATE RMSE [m]": (
-                ate_rmse_m(paths[0], self.truth[known]),
-                ate_rmse_m(paths[1], self.truth[known]),
-            ),
-            "rotation, RMSE [deg]": (
-                turn_rmse_deg(paths[0], self.truth[known]),
-                turn_rmse_deg(paths[1], self.truth[known]),
-            ),
-        }
+        before, after, truth = self.odometry[known], self.poses[known], self.truth[known]
+        measures = {"position, ATE RMSE [m]": ate_rmse_m, "rotation, RMSE [deg]": turn_rmse_deg}
+        return {name: (measure(before, truth), measure(after, truth)) for name, measure in measures.items()}
 
 
 def close(
@@ -108,15 +96,17 @@ def close(
         for number, step in enumerate(steps_between(path))
         if drive[number] == drive[number + 1]
     ]
-    edges = []
-    for loop in taken:
-        assert loop.relative is not None
-        edges.append(Edge(node[loop.match], node[loop.query], *constraint(loop.relative)))
+    edges = loop_edges(taken, node)
     solution = solve(path, steps, edges)
     known = None if truth is None else truth[frames]
     left_out = len(loops) - len(measured), len(measured) - len(taken)
     found = frames, path, solution.poses, steps, edges, taken, solution.accepted, left_out[0], known
     return Closed(*found, no_path=left_out[1], gaps=len(frames) - 1 - len(steps))
+
+
+def loop_edges(loops: Sequence[Loop], node: Mapping[int, int] | range) -> list[Edge]:
+    """Return the edges of the loops that were measured; ``node`` has the node of each frame."""
+    return [Edge(node[x.match], node[x.query], *constraint(x.relative)) for x in loops if x.relative is not None]
 
 
 def constraint(relative: Relative) -> tuple[np.ndarray, np.ndarray]:
@@ -182,14 +172,17 @@ def summary(closed: Closed) -> list[str]:
         lines.append(f"{closed.no_path} more left out: one of their frames has no odometry")
     if closed.gaps:
         lines.append(f"the odometry has {closed.gaps} gaps, where it jumps or another drive begins; loops bridge them")
+    relatives = [loop.relative for loop in closed.loops if loop.relative is not None]
     for by, words in ((DEPTH, "depth"), (ODOMETRY, "steps of the odometry")):
-        if count := sum(loop.relative is not None and loop.relative.length_by == by for loop in closed.loops):
+        if count := sum(relative.length_by == by for relative in relatives):
             lines.append(f"{count} loops measured in meters, from {words}")
     meanings = {
         UP_TO_SCALE: "measured from color alone: a rotation, and the direction of the translation (up to scale)",
         ROTATION_ONLY: "give a rotation only: the camera turned and hardly moved, so the translation is undetermined",
     }
-    lines += [f"{count} loops {words}" for kind, words in meanings.items() if (count := closed.count(kind))]
+    for kind, words in meanings.items():
+        if count := sum(relative.kind == kind for relative in relatives):
+            lines.append(f"{count} loops {words}")
     errors = closed.errors()
     if errors is None:
         lines.append("error: not known without true poses")

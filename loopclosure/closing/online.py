@@ -21,7 +21,7 @@ from threading import Event, Lock, Thread
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loopclosure.closing.close import Closed, constraint
+from loopclosure.closing.close import Closed, constraint, loop_edges
 from loopclosure.closing.graph import Edge, cross_matrices, solve
 from loopclosure.closing.incremental import IncrementalSolver, installed
 from loopclosure.closing.length import FARTHEST, measured, neighbors
@@ -205,14 +205,14 @@ class LoopCloser:
         self.solve()
         with self._lock:
             graph = self._graph
-            count, edges = len(self._solved), _edges(graph.loops)
+            count = len(self._solved)
             kept = graph.loops[: len(self._accepted)]
             return Closed(
                 np.arange(count),
                 self._odometry()[:count],
                 self._solved,
                 [step for step in graph.steps if step.second < count],
-                edges[: len(kept)],
+                loop_edges(kept, range(count)),
                 kept,
                 self._accepted,
                 0,
@@ -226,7 +226,7 @@ class LoopCloser:
                 start = self._corrected(odometry)
             if not len(odometry):
                 return
-            found = self._solve(start, steps, _edges(loops))
+            found = self._solve(start, steps, loop_edges(loops, range(len(odometry))))
             with self._lock:
                 self._solved, self._accepted = found.poses, found.accepted
                 # The robot's, not the camera's: both have the same motion, so the mount cancels out.
@@ -262,11 +262,3 @@ class LoopCloser:
 
 def _inverse(pose: np.ndarray) -> np.ndarray:
     return relative_pose(pose, STILL)
-
-
-def _edges(loops: Sequence[Loop]) -> list[Edge]:
-    found = []
-    for loop in loops:
-        assert loop.relative is not None
-        found.append(Edge(loop.match, loop.query, *constraint(loop.relative)))
-    return found

@@ -113,32 +113,26 @@ def _pose_notes(sequence: ImageSequence) -> list[str]:
     return [*([f"frames without a pose, left out: {without}"] if without else []), *sequence.doubts]
 
 
-@dataclass(frozen=True)
-class FabmapFiles:
-    """The mask of loops and the coordinates of a set in FAB-MAP's form; None is a file of its folder."""
-
-    truth: str | Path | None = None
-    coordinates: str | Path | None = None
-
-
 def load_fabmap(
     folder: str | Path,
-    files: FabmapFiles = FabmapFiles(),
     camera: str = "both",
     selection: Selection = ALL_FRAMES,
     exclusion: Exclusion = FABMAP_EXCLUSION,
+    *,
+    truth_file: str | Path | None = None,
+    coordinates: str | Path | None = None,
 ) -> DataSet:
     """Load a set in the format of FAB-MAP's New College and City Centre: numbered images of two cameras.
 
     Image 0001 is the left one of the first place, 0002 the right one, and so on. The mask (``*GroundTruth.mat``) and
-    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless ``files`` names them.
+    the coordinates (``*Coordinates.mat`` or ``.txt``) are searched for in the folder unless they are given.
 
     camera     which images are used: see loopclosure.places.masks
     selection  counts images of one camera, or with "both" of both
     """
     folder = Path(folder)
     images = image_paths(folder)
-    truth_path = Path(files.truth) if files.truth else _only_file(folder, ("*GroundTruth.mat",), "the mask of loops")
+    truth_path = Path(truth_file) if truth_file else _only_file(folder, ("*GroundTruth.mat",), "the mask of loops")
     assert truth_path is not None
     hard, soft, notes = _fold(truth_path, *read_truth_matrix(truth_path))
     places = images_of_places(camera, len(images))
@@ -149,7 +143,7 @@ def load_fabmap(
     if camera == "both":
         notes.append("pairs of a left and a right image are not judged: the two cameras look to opposite sides")
     sequence = ImageSequence.of_files([images[place] for place in places])
-    queries = replace(sequence, poses=_fabmap_poses(folder, files.coordinates, len(images), places))
+    queries = replace(sequence, poses=_fabmap_poses(folder, coordinates, len(images), places))
     rule = f"same place: as {truth_path.name} says"
     truth = sequence_truth(hard, exclusion, rule, soft=soft, comparable=judged)
     views = "left and right images" if camera == "both" else f"{camera} images"

@@ -18,7 +18,7 @@ from loopclosure.places.frames import is_video, video_length
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.intrinsics import kitti_projection, read_intrinsics, yaml_numbers
 from loopclosure.places.pose_files import PoseForm, matrix_fault, number, read_poses, seconds_of
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, moved
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, associate, moved
 from netspec.errors import SpecError
 from netspec.files.image_list import list_images
 from netspec.files.kinds import nearest_existing, unreadable
@@ -77,7 +77,7 @@ def _chosen(
     found = read.of_images(len(sequence), sequence.stamps, choice.path, max_difference, measured)
     if read.form == layout_of(sequence.source):
         found = moved(found, _camera_in_body(sequence.source))
-    return found, _named(read.doubts, choice.path)
+    return found, tuple(f"{choice.path}: {doubt}" for doubt in read.doubts)
 
 
 def _camera_in_body(source: Path) -> np.ndarray:
@@ -196,10 +196,8 @@ def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) ->
     depths = list_images(listing)
     if depths.stamps is None:
         raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
-    times = seconds_of(depths.stamps)
-    nearest = np.abs(stamps[:, None] - times).argmin(axis=1)
-    near = np.abs(stamps - times[nearest]) <= max_difference
-    return tuple(depths.paths[number] if there else None for number, there in zip(nearest, near, strict=True))
+    nearest = associate(stamps, seconds_of(depths.stamps), max_difference)
+    return tuple(None if number < 0 else depths.paths[number] for number in nearest)
 
 
 def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:
@@ -226,7 +224,10 @@ def _euroc(folder: Path, max_difference: float, own_poses: bool) -> ImageSequenc
             expected = "a time in nanoseconds and the name of an image, with a comma between them"
             raise InputError(f'expected {expected}, found "{",".join(row.cells):.60}"', listing, row.line, 1)
         stamps.append(int(row.cells[0]) * 1e-9)
-        images.append(_existing(listing.parent / "data" / row.cells[1], listing, row.line))
+        image = listing.parent / "data" / row.cells[1]
+        if not os.path.isfile(image):
+            raise InputError(f'no such image "{image.name}" in {image.parent}', listing, row.line, 1)
+        images.append(image)
     if not images:
         raise InputError("lists no images", listing)
     order = np.argsort(stamps, kind="stable")
@@ -303,13 +304,3 @@ def _times(path: Path, frames: int) -> np.ndarray:
 
 def _names(images: tuple[Path, ...], folder: Path) -> tuple[str, ...]:
     return tuple(image.relative_to(folder).as_posix() for image in images)
-
-
-def _existing(image: Path, listing: Path, line_number: int) -> Path:
-    if not os.path.isfile(image):
-        raise InputError(f'no such image "{image.name}" in {image.parent}', listing, line_number, 1)
-    return image
-
-
-def _named(doubts: tuple[str, ...], path: Path) -> tuple[str, ...]:
-    return tuple(f"{path}: {doubt}" for doubt in doubts)

@@ -15,7 +15,7 @@ from loopclosure.detector.decision import LoopResult
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.report.page import Kind, Pair, rendered, side_by_side, spread
-from loopclosure.report.plots import AXES, FOUND, MISSED, STYLE
+from loopclosure.report.plots import FOUND, MISSED, STYLE, longest_axes
 from netspec.files.figures import COLORS, GRID, png
 from netspec.files.whole_file import write_whole
 
@@ -76,9 +76,8 @@ def _dots(results: Sequence[LoopResult]) -> Figure:
 
 def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
     """Draw the path in the plane of the two axes along which it is longest."""
-    positions = poses[:, :3]
-    across = np.sort(np.argsort(np.nanmax(positions, axis=0) - np.nanmin(positions, axis=0), kind="stable")[1:])
-    places = positions[:, across]
+    across, labels = longest_axes(poses[:, :3])
+    places = poses[:, across]
     ends = np.array(
         [pair for pair in _loops_in_drive(results) if np.all(np.isfinite(places[list(pair)]))], int
     ).reshape(-1, 2)
@@ -89,8 +88,8 @@ def _path(poses: np.ndarray, results: Sequence[LoopResult]) -> Figure:
         axis.add_collection(LineCollection(list(places[ends]), colors=FOUND, linewidths=0.8, alpha=0.7))
         axis.plot(*places[ends].reshape(-1, 2).T, ".", color=FOUND, markersize=3)
         axis.set_aspect("equal")
-        axis.set_xlabel(AXES[across[0]])
-        axis.set_ylabel(AXES[across[1]])
+        axis.set_xlabel(labels[0])
+        axis.set_ylabel(labels[1])
         return figure
 
 

@@ -28,7 +28,7 @@ from loopclosure.precision_recall import ALL_PAIRS, BEST_MATCH
 from netspec.errors import printable
 from netspec.files import figures
 from netspec.files.figures import COLORS
-from netspec.files.whole_file import whole_file
+from netspec.files.whole_file import write_whole
 
 FOUND, FALSE, MISSED, NEARLY = "#1a9641", "#d7191c", "#9e9e9e", "#f4a582"
 LINES = ("-", "--", ":", "-.")  # the second use of a color is dashed, and so on
@@ -227,10 +227,16 @@ def legends_below(figure: Figure, axes: Iterable[Axes]) -> None:
     figure.set_figheight(figure.get_figheight() + max(heights))
 
 
+def longest_axes(positions: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Return the two axes along which positions (N, 3) in meters, NaN where not known, are longest, and their names."""
+    spans = np.nanmax(positions, axis=0) - np.nanmin(positions, axis=0)
+    across = np.sort(np.argsort(-spans, kind="stable")[:2])
+    return across, [f"{'xyz'[axis]} [m]" for axis in across]
+
+
 def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray) -> None:
-    spans = np.ptp(positions, axis=0)
-    across, along = sorted(np.argsort(-spans, kind="stable")[:2])
-    place = positions[:, [across, along]]
+    across, names = longest_axes(positions)
+    place = positions[:, across]
     axis.plot(place[:, 0], place[:, 1], color="#303030", linewidth=0.6, zorder=1)
     for order, (queries, references, color) in enumerate(_drawn(outcome, truth), start=2):
         chords = np.stack([place[queries], place[references]], axis=1)
@@ -239,8 +245,8 @@ def _draw_map(axis: Axes, outcome: Outcome, truth: Truth, positions: np.ndarray)
         axis.add_collection(LineCollection(list(chords), colors=color, linewidths=width * thin, zorder=order))
         axis.plot(place[queries, 0], place[queries, 1], ".", color=color, markersize=2.5, zorder=order)
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel(f"{'xyz'[across]} [m]")
-    axis.set_ylabel(f"{'xyz'[along]} [m]")
+    axis.set_xlabel(names[0])
+    axis.set_ylabel(names[1])
 
 
 def _drawn(outcome: Outcome, truth: Truth) -> list[tuple[np.ndarray, np.ndarray, str]]:
@@ -304,9 +310,6 @@ def _label_left(axes: list[Axes], label: str) -> None:
             axis.set_ylabel(label)
 
 
-AXES = ("x [m]", "y [m]", "z [m]")
-
-
 def draw_paths(path: Path, closed: Closed, names: tuple[str, str] = ("odometry", "loops closed")) -> None:
     """Draw both paths, and the true path if it is known, as PNG, in the plane of the two longest axes.
 
@@ -319,8 +322,7 @@ def draw_paths(path: Path, closed: Closed, names: tuple[str, str] = ("odometry",
         if np.count_nonzero(known) >= 3:
             paths = {name: aligned(poses, closed.truth, known) for name, poses in paths.items()}
             paths["true"] = closed.truth[known]
-    reference = list(paths.values())[-1]
-    across = np.sort(np.argsort(np.ptp(reference[:, :3], axis=0), kind="stable")[1:])
+    across, labels = longest_axes(list(paths.values())[-1][:, :3])
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9, 4.6), layout="constrained")
         errors = closed.errors()
@@ -336,10 +338,9 @@ def draw_paths(path: Path, closed: Closed, names: tuple[str, str] = ("odometry",
             axis.plot(*poses.T, color=COLORS[1 - number], lw=1, label=name)
             error = "" if errors is None else f", ATE {next(iter(errors.values()))[number]:.3g} m"
             axis.set_title(f"{name}{error}")
-            axis.set_xlabel(AXES[across[0]])
+            axis.set_xlabel(labels[0])
             axis.set_aspect("equal")
             axis.legend(loc="best")
             if number == 0:
-                axis.set_ylabel(AXES[across[1]])
-        with whole_file(path) as unfinished:
-            figure.savefig(unfinished, format="png")
+                axis.set_ylabel(labels[1])
+        write_whole(path, figures.png(figure))

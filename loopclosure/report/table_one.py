@@ -19,7 +19,9 @@ from scipy.stats import rankdata
 
 from loopclosure.csv_file import write_csv
 from loopclosure.errors import InputError
-from netspec.files.whole_file import whole_file
+from netspec.files.arrays import read_npz
+from netspec.files.figures import png
+from netspec.files.whole_file import write_whole
 from netspec.terminal.output import in_columns
 
 # Qiu et al., IEEE IV 2018, Table I. The paper gives neither the threshold nor the recall.
@@ -93,14 +95,17 @@ def read_runs(path: Path, judged: str = "validation") -> list[Run]:
 def _judge(entry: dict[str, Any], judged: str) -> Run:
     parts = []
     for kind in ("train", judged):
-        with _open(entry[kind]) as arrays:
-            a, b, label = (_array(arrays, name, entry[kind]) for name in (*entry["descriptors"], entry["label"]))
-            parts.append((pair_distances(a, b), label.reshape(-1) != 0))
-            seconds, parameters = float(arrays["seconds_per_record"]), int(arrays["parameters"])
+        arrays = read_npz(entry[kind], "the features that netspec extract writes")
+        names = (*entry["descriptors"], entry["label"])
+        if missing := [name for name in names if name not in arrays]:
+            raise InputError(f'no array "{missing[0]}"; it has: {", ".join(arrays)}', entry[kind])
+        a, b, label = (arrays[name] for name in names)
+        parts.append((pair_distances(a, b), label.reshape(-1) != 0))
+        seconds, parameters = float(arrays["seconds_per_record"]), int(arrays["parameters"])
     (train_distances, train_labels), (distances, labels) = parts
     return Run(
         name=entry["name"],
-        metrics=judge_pairs(train_distances, train_labels, distances, labels),
+        metrics=metrics_at(best_threshold(train_distances, train_labels), distances, labels),
         distances=distances,
         labels=labels,
         losses=tuple((int(k), float(loss)) for k, loss in entry["losses"]),
@@ -110,23 +115,10 @@ def _judge(entry: dict[str, Any], judged: str) -> Run:
     )
 
 
-def _open(path: str) -> Any:
-    try:
-        return np.load(path)
-    except (OSError, ValueError) as fault:
-        raise InputError(f"cannot read these features: {fault}", path) from None
-
-
-def _array(arrays: Any, name: str, path: str) -> np.ndarray:
-    if name not in arrays:
-        raise InputError(f'no array "{name}"; it has: {", ".join(arrays.files)}', path)
-    return arrays[name]
-
-
 def text_table(runs: Sequence[Run], judged: str = "validation") -> str:
     """Return the table as text, with the paper's precisions below it; ``judged`` as in ``read_runs``."""
     paper = ", ".join(f"{name} {100 * precision:.1f} %" for name, precision in PAPER)
-    pairs, nets = f"{runs[0].metrics.pairs} {judged} pairs" if runs else "no runs", by_net(runs)
+    pairs, nets = f"{len(runs[0].labels)} {judged} pairs" if runs else "no runs", by_net(runs)
     intervals = {net[0].name: ", ".join(f"{name} {text}" for name, text in summary(net).items()) for net in nets}
     return "\n".join(
         [
@@ -144,13 +136,13 @@ def write_report(runs: Sequence[Run], folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("table.csv", "losses.png", "distances.png")]
     write_csv(paths[0], COLUMNS, map(_cells, by_net(runs)))
-    _draw_losses(runs, paths[1])
-    _draw_distances(runs, paths[2])
+    write_whole(paths[1], png(_losses(runs)))
+    write_whole(paths[2], png(_distances(runs)))
     return paths
 
 
-def _draw_losses(runs: Sequence[Run], path: Path) -> None:
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+def _losses(runs: Sequence[Run]) -> Figure:
+    figure = Figure(figsize=(7, 4.2), dpi=120, layout="constrained")
     axes = figure.subplots()
     for run in runs:
         if run.losses:
@@ -166,12 +158,11 @@ def _draw_losses(runs: Sequence[Run], path: Path) -> None:
         axes.set_yscale("log")
     axes.grid(alpha=0.3, which="both")
     axes.legend()
-    with whole_file(path) as unfinished:
-        figure.savefig(unfinished, dpi=120, format="png")
+    return figure
 
 
-def _draw_distances(runs: Sequence[Run], path: Path) -> None:
-    figure = Figure(figsize=(3.6 * len(runs) + 0.6, 3.4), layout="constrained")
+def _distances(runs: Sequence[Run]) -> Figure:
+    figure = Figure(figsize=(3.6 * len(runs) + 0.6, 3.4), dpi=120, layout="constrained")
     grid = figure.subplots(1, len(runs), squeeze=False)
     for axes, run in zip(grid[0], runs, strict=True):
         edges = np.histogram_bin_edges(run.distances, 40)
@@ -182,8 +173,7 @@ def _draw_distances(runs: Sequence[Run], path: Path) -> None:
         axes.title.set_fontsize(10)
     grid[0][0].set_ylabel("validation pairs")
     grid[0][0].legend(fontsize=8)
-    with whole_file(path) as unfinished:
-        figure.savefig(unfinished, dpi=120, format="png")
+    return figure
 
 
 @dataclass(frozen=True)
@@ -199,15 +189,6 @@ class PairMetrics:
     accuracy: float
     f1: float
     roc_auc: float
-    true_positives: int
-    false_positives: int
-    true_negatives: int
-    false_negatives: int
-
-    @property
-    def pairs(self) -> int:
-        """Return the number of pairs judged."""
-        return self.true_positives + self.false_positives + self.true_negatives + self.false_negatives
 
 
 def pair_distances(features_a: np.ndarray, features_b: np.ndarray) -> np.ndarray:
@@ -262,7 +243,7 @@ def roc_auc(distances: np.ndarray, labels: np.ndarray) -> float:
 
 
 def metrics_at(threshold: float, distances: np.ndarray, labels: np.ndarray) -> PairMetrics:
-    """Return the metrics of these pairs at a given threshold."""
+    """Return the metrics of these pairs at a given threshold: distances (N,); labels (N,) 1 or True = same place."""
     distances, same = _checked(distances, labels)
     called = distances < threshold
     tp = int(np.count_nonzero(called & same))
@@ -276,21 +257,7 @@ def metrics_at(threshold: float, distances: np.ndarray, labels: np.ndarray) -> P
         accuracy=_share(tp + tn, len(same)),
         f1=_share(2 * tp, 2 * tp + fp + fn),
         roc_auc=roc_auc(distances, same),
-        true_positives=tp,
-        false_positives=fp,
-        true_negatives=tn,
-        false_negatives=fn,
     )
-
-
-def judge_pairs(
-    train_distances: np.ndarray, train_labels: np.ndarray, distances: np.ndarray, labels: np.ndarray
-) -> PairMetrics:
-    """Choose the threshold on the training pairs and judge the other pairs with it: one row of Table I.
-
-    All four are (N,) or (M,); labels are 1 for same place, 0 for other place.
-    """
-    return metrics_at(best_threshold(train_distances, train_labels), distances, labels)
 
 
 def summary(runs: Sequence[Run], draws: int = 1000, seed: int = 0) -> dict[str, str]:

@@ -80,7 +80,11 @@ Output = tuple[int, int]  # a box, and the index of its top
 
 @dataclass(frozen=True)
 class Attached:
-    """An in-place layer, drawn in the box of the layer that computed its blob."""
+    """An in-place layer, drawn in the box of the layer that computed its blob.
+
+    ``kind`` is the module of netspec.layers that defines it. ``phases`` are the phases that have it, or empty if all
+    drawn phases do.
+    """
 
     name: str
     type: str
@@ -90,20 +94,14 @@ class Attached:
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(Attached):
     """A layer in the diagram.
 
-    ``kind`` is the module of netspec.layers that defines it. ``phases`` are the phases that have it, or empty if all
-    drawn phases do. ``weights`` is the number of its own weights; ``owner`` is the layer that it shares parameters
-    with. ``work`` is its multiply-adds in one forward pass. ``text`` is its prototxt and that of the attached layers.
-    ``same`` is equal for layers that differ only in names.
+    ``weights`` is the number of its own weights; ``owner`` is the layer that it shares parameters with. ``work`` is its
+    multiply-adds in one forward pass. ``text`` is its prototxt and that of the attached layers. ``same`` is equal for
+    layers that differ only in names.
     """
 
-    name: str
-    type: str
-    kind: str
-    settings: str
-    phases: tuple[str, ...]
     where: Where
     text: str
     same: str
@@ -202,29 +200,21 @@ def _merged(
             origin.update({v: (k, j) for j, v in enumerate(node.tops)})
     drawn = [one.phase for one in seen]
 
-    def phases(number: int) -> tuple[str, ...]:
-        return () if phases_of[number] == drawn else tuple(phases_of[number])
+    def described(number: int) -> tuple[str, str, str, str, tuple[str, ...]]:
+        layer = net.layer[number]
+        phases = () if phases_of[number] == drawn else tuple(phases_of[number])
+        return layer.name, layer.type, kind_of(layer.type), settings_text(layer), phases
 
     boxes = []
     for number, k in index.items():
-        layer = net.layer[number]
-        inside = sorted(attached[k])
-        box = Box(
-            layer.name,
-            layer.type,
-            kind_of(layer.type),
-            settings_text(layer),
-            phases(number),
-            source.at(number, layer=layer.name, type=layer.type),
-            "".join(_text(net.layer[m]) for m in (number, *inside)),
-            "\n".join(f"{phases(m)}{_without_names(net.layer[m])}" for m in (number, *inside)),
-            attached=tuple(
-                Attached(other.name, other.type, kind_of(other.type), settings_text(other), phases(m))
-                for m in inside
-                for other in [net.layer[m]]
-            ),
-        )
-        boxes.append(_with_costs(box, [number, *inside], seen, len(layer.top)))
+        name, type_name, *_ = own = described(number)
+        numbers = [number, *sorted(attached[k])]
+        others = tuple(Attached(*described(m)) for m in numbers[1:])
+        text = "".join(_text(net.layer[m]) for m in numbers)
+        phases = own[-1], *(other.phases for other in others)
+        same = "\n".join(f"{p}{_without_names(net.layer[m])}" for m, p in zip(numbers, phases, strict=True))
+        box = Box(*own, source.at(number, layer=name, type=type_name), text, same, attached=others)
+        boxes.append(_with_costs(box, numbers, seen, len(net.layer[number].top)))
     tops = tuple(tuple(net.layer[number].top) for number in index)
     return Diagram(net.name, tuple(boxes), tuple(map(tuple, reads)), tops, faults)
 

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from loopclosure.errors import InputError
 from loopclosure.places.datasets import (
-    FabmapFiles,
     load_fabmap,
     load_folder,
     load_place_pairs,
@@ -124,7 +123,7 @@ def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
     truth[5, 2] = 1
     np.save(fabmap_folder / "six.npy", truth)
     data = load_fabmap(
-        fabmap_folder, FabmapFiles(fabmap_folder / "six.npy"), camera="right", exclusion=Exclusion(frames=1)
+        fabmap_folder, camera="right", exclusion=Exclusion(frames=1), truth_file=fabmap_folder / "six.npy"
     )
     assert data.truth.hard[5, 2]
     assert data.queries.paths[5].stem == "0012"
@@ -136,7 +135,7 @@ def test_fabmap_faults(fabmap_folder, tmp_path):
         load_fabmap(fabmap_folder, camera="front")
     np.save(tmp_path / "big.npy", np.eye(24, k=-20, dtype=np.uint8))
     with pytest.raises(InputError, match="24 x 24, but there are 12 images; does the folder have only one camera's"):
-        load_fabmap(fabmap_folder, FabmapFiles(tmp_path / "big.npy"))
+        load_fabmap(fabmap_folder, truth_file=tmp_path / "big.npy")
     (fabmap_folder / "ImageCollectionCoordinates.txt").write_text("1 2\n3 4\n")
     with pytest.raises(InputError, match="has 2 rows, but there are 12 images"):
         load_fabmap(fabmap_folder, camera="left", exclusion=Exclusion(frames=1))
