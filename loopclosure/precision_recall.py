@@ -54,13 +54,9 @@ class PrecisionRecall:
     @property
     def recall_at_full_precision(self) -> float:
         """The largest recall before the first mistake; 0 if the highest score is wrong."""
-        return self.recall_at_precision(1.0)
-
-    def recall_at_precision(self, wanted: float) -> float:
-        """Return the largest recall of any threshold with at least this precision; 0 if there is none."""
         if not self.positives:
             return float("nan")
-        return float(np.max(self.recall[self.precision >= wanted], initial=0.0))
+        return float(np.max(self.recall[self.precision >= 1.0], initial=0.0))
 
     @property
     def best_f1(self) -> float:
@@ -175,7 +171,7 @@ class JudgedScores:
         loops = self.truth.queries_with_a_loop
         return BestMatches(np.where(none, -1, reference), score, soft & loops, soft & ~loops)
 
-    def recall_at(self, ks: tuple[int, ...] = (1, 5, 10, 20)) -> dict[int, float]:
+    def recall_at(self, ks: tuple[int, ...]) -> dict[int, float]:
         """Return, for each k, the share of the queries with a loop that have a true reference among their best k.
 
         Soft truth counts as true. Equal scores are ranked in the order of the references. Queries without a loop are

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from loopclosure.cli.data_set import add_frames
 from loopclosure.detector import run
-from loopclosure.detector.decision import DetectorSettings, LoopResult
+from loopclosure.detector.decision import LoopResult
 from loopclosure.detector.describers import load_describe
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.export import write_loops_csv
@@ -19,9 +19,8 @@ from netspec.terminal.output import bar, warn
 from netspec.terminal.parser import Commands
 
 # Settings that --resume reads from the saved detector.
-SETTINGS = ("metric", "exclude_recent", "exclude_seconds", "top_k", "threshold", "consistency", "consistency_window")
+SETTINGS = ("metric", "exclude_recent", "exclude_seconds", "threshold")
 RECENT_SECONDS = 10.0  # frames of the current visit to a place are not loops
-OF = DetectorSettings()
 
 
 def add_commands(commands: Commands) -> None:
@@ -36,19 +35,6 @@ def add_commands(commands: Commands) -> None:
     add_frames(parser, "NAME|MODULE:FUNCTION|FILE.py:FUNCTION", " (default: %(default)s)")
     parser.add_argument(
         "--threshold", type=float, metavar="S", help="lowest score of a loop (euclidean: the negative distance)"
-    )
-    parser.add_argument("--top-k", type=int, metavar="K", help=f"number of candidates to examine (default: {OF.top_k})")
-    parser.add_argument(
-        "--consistency",
-        type=int,
-        metavar="K",
-        help="number of previous frames whose candidates must lead to that of this frame",
-    )
-    parser.add_argument(
-        "--consistency-window",
-        type=int,
-        metavar="FRAMES",
-        help=f"largest step between candidates of successive frames (default: {OF.consistency_window})",
     )
     parser.add_argument(
         "--resume", metavar="F.npz", help="begin another drive, with a detector that --save wrote and its settings"

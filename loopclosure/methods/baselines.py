@@ -20,7 +20,7 @@ from loopclosure.methods.settings import configure
 from loopclosure.places.frames import read_gray
 from loopclosure.progress import Progress, timed
 from loopclosure.words.bag_of_words import BagOfWords, check_metric
-from loopclosure.words.fabmap import FabMapModel, FabMapSettings, score_sequence, score_sets
+from loopclosure.words.fabmap import FabMapModel, FabMapSettings, log_odds
 from loopclosure.words.vocabulary import Extractor
 from loopclosure.words.word_model import TRAINING_STAGES, Training, WordModel, train
 
@@ -96,8 +96,8 @@ class FabMapMethod(_WordMethod):
 
     def _compared(self, model: WordModel, queries: np.ndarray, references: np.ndarray | None) -> tuple[np.ndarray, str]:
         fabmap = FabMapModel(model.tree, model.training_words, self.settings)
-        found = score_sequence(fabmap, queries) if references is None else score_sets(fabmap, queries, references)
-        return found.log_odds, f"FAB-MAP 2.0, score: log odds against a new place; {self.settings}"
+        said = f"FAB-MAP 2.0, score: log odds against a new place; {self.settings}"
+        return log_odds(fabmap, queries, references), said
 
 
 @dataclass

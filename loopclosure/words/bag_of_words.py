@@ -23,9 +23,6 @@ class BagOfWords:
     idf: np.ndarray
     metric: str = "l1"
 
-    def __post_init__(self) -> None:
-        check_metric(self.metric)
-
     @classmethod
     def learn(cls, words: np.ndarray, metric: str = "l1") -> BagOfWords:
         """Weight words by how rare they are among the training images' words (n, v).

@@ -37,11 +37,6 @@ class WordTree:
     def __len__(self) -> int:
         return len(self.parent)
 
-    @property
-    def root(self) -> int:
-        """The word that is its own parent."""
-        return int(np.flatnonzero(self.parent == np.arange(len(self)))[0])
-
 
 def learn_tree(words: np.ndarray, lower_bound: float = LOWER_BOUND) -> WordTree:
     """Learn the tree from the words (n, v) of n training images: counts or presence.

@@ -30,13 +30,11 @@ class FabMapSettings:
     hit          p(word seen | its cause is there), PzGe
     false_alarm  p(word seen | its cause is not there), PzGNe; the Oxford model has 0.005
     recent       number of the last images that are not on the map yet, because they look like the query
-    smoothing    share of the posterior that is kept; the rest is distributed evenly
     """
 
     hit: float = 0.39
     false_alarm: float = 0.0
     recent: int = 0
-    smoothing: float = 0.99
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.false_alarm < self.hit < 1.0:
@@ -95,12 +93,6 @@ class FabMapModel:
         """Return ln p(query | new place) as (Q,) for words (Q, v): the mean over the training images."""
         return logsumexp(self.likelihoods(queries, self.training), axis=1) - np.log(len(self.training))
 
-    def posterior(self, loglik: np.ndarray, loglik_new: float) -> np.ndarray:
-        """Return the distribution (1 + n,) over a new place (entry 0) and n places."""
-        log_p = np.concatenate([[loglik_new], loglik])
-        p = np.exp(log_p - logsumexp(log_p))
-        return self.settings.smoothing * p + (1.0 - self.settings.smoothing) / len(p)
-
     def _word_terms(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ln p(z_q | L_q = 0, a) and ln p(z_q | L_q = 1, a), (Q, v) each, of observations (Q, v) bool."""
         state = 2 * seen + seen[:, self.tree.parent]  # z, a as one index
@@ -109,40 +101,14 @@ class FabMapModel:
         return by_state[words, 0, state], by_state[words, 1, state]
 
 
-@dataclass(frozen=True)
-class PlaceScores:
-    """The result of FAB-MAP for Q images and P places.
+def log_odds(model: FabMapModel, queries: np.ndarray, places: np.ndarray | None = None) -> np.ndarray:
+    """Return ln p(place | image) / p(new place | image), (Q, P), of images with words (Q, v), places with words (P, v).
 
-    posterior  (Q, P) probabilities
-    new        (Q,) probability of a new place
-    log_odds   (Q, P) ln p(place | image) / p(new place | image): of one image in the order of the posterior, but never
-               0 or 1, and not shared among the places that show the same
+    Of one image they are in the order of the posterior, but the share of a place does not depend on how many others
+    show the same. Without ``places``, the images are a sequence, and each is scored on the map of the images before it:
+    NaN for itself, for later ones, and for those that are too recent to be on the map.
     """
-
-    posterior: np.ndarray
-    new: np.ndarray
-    log_odds: np.ndarray
-
-
-def score_sets(model: FabMapModel, queries: np.ndarray, places: np.ndarray) -> PlaceScores:
-    """Score queries with words (Q, v) on a map of places with words (P, v), for two traverses."""
-    return _scored(model, queries, places, np.full(len(queries), len(places)))
-
-
-def score_sequence(model: FabMapModel, words: np.ndarray) -> PlaceScores:
-    """Score each image of a sequence with words (n, v) on the map of the images before it.
-
-    The upper triangle with the diagonal is NaN, and so are images that are too recent to be on the map.
-    """
-    return _scored(model, words, words, np.maximum(0, np.arange(len(words)) - model.settings.recent))
-
-
-def _scored(model: FabMapModel, queries: np.ndarray, places: np.ndarray, known: np.ndarray) -> PlaceScores:
-    """Score each query on the map of the first ``known`` (Q,) places; NaN for the others."""
-    loglik, loglik_new = model.likelihoods(queries, places), model.new_place(queries)
-    loglik[np.arange(loglik.shape[1]) >= known[:, None]] = np.nan
-    posterior, new = np.full_like(loglik, np.nan), np.empty(len(loglik))
-    for i, count in enumerate(known):
-        found = model.posterior(loglik[i, :count], loglik_new[i])
-        new[i], posterior[i, :count] = found[0], found[1:]
-    return PlaceScores(posterior, new, loglik - loglik_new[:, None])
+    found = model.likelihoods(queries, queries if places is None else places) - model.new_place(queries)[:, None]
+    if places is None:
+        found[~np.tri(len(found), k=-1 - model.settings.recent, dtype=bool)] = np.nan
+    return found

@@ -85,17 +85,9 @@ class Vocabulary:
     def __len__(self) -> int:
         return len(self.centers)
 
-    def nearest(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the word (n,) of each descriptor (n, d): its nearest center."""
-        return nearest_centers(descriptors, self.centers)
-
-    def count(self, image: np.ndarray) -> np.ndarray:
-        """Count each word in an (H, W) or (H, W, 3) uint8 image: (v,) int32."""
-        return self.count_descriptors(self.extractor(image))
-
     def count_descriptors(self, descriptors: np.ndarray) -> np.ndarray:
         """Count each word among descriptors (n, d): (v,) int32."""
-        return np.bincount(self.nearest(descriptors), minlength=len(self)).astype(np.int32)
+        return np.bincount(nearest_centers(descriptors, self.centers), minlength=len(self)).astype(np.int32)
 
 
 def nearest_centers(descriptors: np.ndarray, centers: np.ndarray) -> np.ndarray:

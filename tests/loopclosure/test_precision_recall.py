@@ -126,11 +126,6 @@ def test_seconds_exclude_by_stamps():
         sequence_truth(np.ones((4, 4), bool), Exclusion(seconds=1.5), "x")
 
 
-def test_recall_at_a_wanted_precision():
-    found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
-    assert found.recall_at_precision(0.8) == 1.0
-
-
 def test_best_f1():
     found = JudgedScores(SCORES, example_truth()).all_pairs_curve()
     assert found.best_f1 == pytest.approx(2 * 0.8 / 1.8)

@@ -49,7 +49,7 @@ def test_a_blank_image_has_no_features_and_no_words(kind: str) -> None:
     blank = np.full((120, 160), 90, np.uint8)
     assert extractor(blank).shape == (0, extractor.size)
     vocabulary = Vocabulary(np.eye(3, extractor.size, dtype=np.float32), extractor)
-    np.testing.assert_array_equal(vocabulary.count(blank), [0, 0, 0])
+    np.testing.assert_array_equal(vocabulary.count_descriptors(extractor(blank)), [0, 0, 0])
 
 
 def test_the_number_of_features_is_limited_and_color_becomes_gray() -> None:
@@ -64,7 +64,6 @@ def test_the_number_of_features_is_limited_and_color_becomes_gray() -> None:
         (lambda: Extractor(kind="surf"), '"surf"; known: sift, orb'),
         (lambda: Extractor(max_features=0), "is 0"),
         (lambda: kmeans(unit_vectors(7), 8), "7 descriptors cannot make 8 words"),
-        (lambda: BagOfWords(np.ones(3), "chi2"), '"chi2" of the bag of words; known: l1, cosine'),
     ],
 )
 def test_impossible_settings_and_descriptors_are_refused(make: Callable[[], object], message: str) -> None:
@@ -80,7 +79,6 @@ def test_nearest_center_across_blocks() -> None:
 def test_words_are_counted() -> None:
     centers = unit_vectors(5, 128)
     vocabulary = Vocabulary(centers, Extractor())
-    np.testing.assert_array_equal(vocabulary.nearest(centers[[3, 1, 3]]), [3, 1, 3])
     np.testing.assert_array_equal(vocabulary.count_descriptors(centers[[3, 1, 3]]), [0, 1, 0, 2, 0])
     assert len(vocabulary) == 5
 
