@@ -28,7 +28,6 @@ from loopclosure.places.datasets import load_folder
 from loopclosure.places.frames import image_paths
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.sequences import read_sequence
-from loopclosure.places.trajectory import Poses
 
 GAP = 30  # frames nearer than this in one drive are not a loop
 NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that overlap
@@ -114,7 +113,7 @@ def _posed(folders: Sequence[Path], gap: int = GAP) -> Real:
     paths = [path for part in parts for path in part.paths]
     poses = np.concatenate([part.poses for part in parts if part.poses is not None])
     known = np.flatnonzero(np.all(np.isfinite(poses), axis=1))
-    posed = Poses(poses[known, :3], poses[known, 3:])
+    posed = poses[known]
     rule, wide = (same_place_matrix(posed, posed, MAX_DISTANCE_M, angle) for angle in (MAX_ANGLE_DEG, SOFT_DEG))
     return Real("", [paths[i] for i in known.tolist()], rule, wide, _pairs_before(len(known), gap), gap)
 

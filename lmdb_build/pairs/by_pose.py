@@ -19,7 +19,6 @@ from loopclosure.places.same_place import (
     same_place,
     view_angles_deg,
 )
-from loopclosure.places.trajectory import Poses
 
 # The relations of two sequences.
 SAME_SEQUENCE, ONE_FRAME, ONE_SCENE, OTHER_SCENE = range(4)
@@ -105,10 +104,7 @@ class PoseSource(PairSource):
         ]
         self.groups = self.tracks = np.repeat(np.arange(len(sequences)), [len(sequence) for sequence in sequences])
         self.stamps = np.concatenate([_times(sequence) for sequence in sequences])
-        poses = [sequence.known_poses() for sequence in sequences]
-        self.poses = Poses(
-            np.concatenate([each.positions for each in poses]), np.concatenate([each.quaternions for each in poses])
-        )
+        self.poses = np.concatenate([sequence.known_poses() for sequence in sequences])
         self.rule, self.scenes = rule, scenes
         self._relations = scenes.relations(self.group_names)
         clear = []

@@ -22,7 +22,7 @@ from lmdb_build.walk.house import House, build_house
 from lmdb_build.walk.render import Renderer
 from loopclosure.errors import InputError
 from loopclosure.places.intrinsics import Intrinsics, write_calibration
-from loopclosure.places.trajectory import Poses, Trajectory, write_rgb_list, write_trajectory
+from loopclosure.places.trajectory import write_rgb_list, write_trajectory
 from netspec.files.opencv import cv2
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     house = build_house(walk.seed, walk.rooms)
     walked = np.arange(walk.frames) * walk.laps * house.lap_m / walk.frames
     poses = _poses(house, walk, walked)
-    rotations = Rotation.from_quat(poses.quaternions).as_matrix()
+    rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
     stamps = walk.start_s + walked / SPEED_M_S
     frames = [(stamp, f"rgb/{stamp:.6f}.jpg") for stamp in stamps]
     depths = [(stamp, f"depth/{stamp:.6f}.png") for stamp in stamps]
@@ -90,14 +90,14 @@ def write_walk(folder: str | os.PathLike[str], walk: Walk) -> Iterator[Path]:
     for i, lap in enumerate((walked // house.lap_m).astype(int)):
         if renderer is None or lap != lap_before:
             renderer, lap_before = Renderer(house, walk.camera, _light(walk, lap)), lap
-        picture, depth = renderer.draw(poses.positions[i], rotations[i])
+        picture, depth = renderer.draw(poses[i, :3], rotations[i])
         noise = rng.normal(0, NOISE, picture.shape).astype(np.int8)
         write_jpeg(folder / frames[i][1], cv2.add(picture, noise, dtype=cv2.CV_8U))
         if walk.depth:
             write_depth(folder / depths[i][1], depth)
         yield folder / frames[i][1]
     write_calibration(folder / "calibration.txt", walk.camera)
-    write_trajectory(folder / "groundtruth.txt", Trajectory(stamps, poses.positions, poses.quaternions))
+    write_trajectory(folder / "groundtruth.txt", stamps, poses)
     if walk.depth:
         write_rgb_list(folder / "depth.txt", depths, "depth maps")
     write_rgb_list(folder / "rgb.txt", frames)  # last: it makes the sequence complete
@@ -111,8 +111,8 @@ def _light(walk: Walk, lap: int) -> Array:
     return lamps * np.array([1 - warmth, 1, 1 + warmth])
 
 
-def _poses(house: House, walk: Walk, walked: Array) -> Poses:
-    """Return the camera's poses (N,) after so many meters (N,)."""
+def _poses(house: House, walk: Walk, walked: Array) -> Array:
+    """Return the camera's poses (N, 7) after so many meters (N,)."""
     rng = np.random.default_rng([walk.seed, 5])
     lap_m, count = house.lap_m, len(house.way)
 
@@ -132,4 +132,4 @@ def _poses(house: House, walk: Walk, walked: Array) -> Poses:
     level = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     angles = np.degrees(yaw) + TURN_DEG * sway + glance, np.full(len(x), PITCH_DEG)
     turned = Rotation.from_euler("ZY", np.column_stack(angles), degrees=True)
-    return Poses(positions, (turned * level).as_quat(canonical=True))
+    return np.hstack([positions, (turned * level).as_quat(canonical=True)])

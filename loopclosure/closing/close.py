@@ -18,7 +18,7 @@ from loopclosure.csv_file import write_csv
 from loopclosure.detector.export import LOOP_SIGMAS, Sigmas, information_of_step, relative_pose, write_pose_graph
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_DISTANCE_M
-from loopclosure.places.trajectory import Trajectory, pieces, write_trajectory
+from loopclosure.places.trajectory import pieces, write_trajectory
 
 # Of the errors of a loop that all its points have in common, by the calibration, by the depth, or by a translation that
 # was taken for a rotation: with depth; from color alone they are LOOP_SIGMAS.
@@ -139,7 +139,7 @@ def write_closed(out: Path, closed: Closed, stamps: np.ndarray | None, names: Se
     out.mkdir(parents=True, exist_ok=True)
     times = closed.frames.astype(float) if stamps is None else stamps[closed.frames]
     for name, poses in (("closed", closed.poses), ("odometry", closed.odometry)):
-        write_trajectory(out / f"{name}.txt", Trajectory(times, poses[:, :3], poses[:, 3:]), name)
+        write_trajectory(out / f"{name}.txt", times, poses, name)
     write_graph(out, closed, names)
 
 

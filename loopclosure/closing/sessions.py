@@ -20,7 +20,7 @@ from loopclosure.detector.map import SESSION, Map, Session
 from loopclosure.detector.verification import GeometricCheck
 from loopclosure.errors import InputError
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M
-from loopclosure.places.trajectory import Trajectory, pieces, write_trajectory
+from loopclosure.places.trajectory import pieces, write_trajectory
 from loopclosure.progress import Progress, silent
 
 MOST_TRIED = 200  # loops of two sessions that are tried as the one that places them
@@ -88,8 +88,7 @@ def write_closed_map(out: Path, found: ClosedMap) -> None:
         own, stamps = poses[begin : begin + len(session.names)], np.asarray(session.arrays["stamps"])
         kept = np.isfinite(own).all(axis=1)
         times = np.where(np.isfinite(stamps), stamps, np.arange(len(own)))[kept]
-        trajectory = Trajectory(times, own[kept, :3], own[kept, 3:])
-        write_trajectory(out / f"{session.folder.name}.txt", trajectory, "corrected")
+        write_trajectory(out / f"{session.folder.name}.txt", times, own[kept], "corrected")
 
 
 def _measured(known: Map, starts: np.ndarray, path: np.ndarray, progress: Progress) -> list[Loop]:

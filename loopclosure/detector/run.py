@@ -14,7 +14,6 @@ from loopclosure.detector.visitor import Visitor
 from loopclosure.errors import InputError
 from loopclosure.places.image_sequence import ImageSequence
 from loopclosure.places.same_place import same_place
-from loopclosure.places.trajectory import Poses
 from loopclosure.progress import Progress, silent
 
 
@@ -106,6 +105,5 @@ def judged_by_poses(detector: LoopDetector) -> str:
     poses = detector.poses
     ends = np.array([(loop.query, loop.match) for loop in detector.loops], int).reshape(-1, 2)
     known = ends[np.all(np.isfinite(poses[ends]), axis=(1, 2))]
-    a, b = (Poses(poses[column, :3], poses[column, 3:]) for column in known.T)
-    right = int(np.count_nonzero(same_place(a, b)))
+    right = int(np.count_nonzero(same_place(*poses[known.T])))
     return f"{right} of {len(known)} loops are the same place by their poses (2 m, 15 degrees)"

@@ -12,7 +12,6 @@ import numpy as np
 from loopclosure.errors import InputError
 from loopclosure.places.frames import DEPTH_PER_M, Selection, read_bgr, video_frames
 from loopclosure.places.intrinsics import Intrinsics
-from loopclosure.places.trajectory import Poses
 from netspec.files.image_list import ImageList
 
 MOST_NAMES = 10  # of unreadable images in a message
@@ -116,10 +115,10 @@ class ImageSequence(ImageList):
             raise InputError(f"none of its {len(self)} images has a pose", self.source)
         return self.at(known)
 
-    def known_poses(self) -> Poses:
-        """Return the poses of a sequence in which every frame has one; see :meth:`with_poses`."""
+    def known_poses(self) -> np.ndarray:
+        """Return the poses (N, 7) of a sequence in which every frame has one; see :meth:`with_poses`."""
         assert self.poses is not None
-        return Poses(self.poses[:, :3], self.poses[:, 3:])
+        return self.poses
 
     def with_files(self) -> ImageSequence:
         """Return the sequence itself. Raises InputError for the first missing image."""

@@ -18,7 +18,7 @@ from loopclosure.places.intrinsics import write_calibration
 from loopclosure.places.masks import CAMERAS
 from loopclosure.places.pose_files import WORDS, pose_form
 from loopclosure.places.sequences import GROUNDTRUTH, ODOMETRY, PoseChoice, benchmark_parts, layout_of, read_sequence
-from loopclosure.places.trajectory import MAX_DIFFERENCE_S, Trajectory, write_rgb_list, write_trajectory
+from loopclosure.places.trajectory import MAX_DIFFERENCE_S, write_rgb_list, write_trajectory
 from loopclosure.progress import Progress, silent
 from netspec.errors import did_you_mean
 from netspec.files.kinds import nearest_existing
@@ -269,9 +269,7 @@ def _bag(source: Path, folder: Path, topics: Topics, progress: Progress) -> tupl
             bag.doubts.append("a topic has stamps that are 0, equal or go back; times of receipt are used instead")
         stamps = recorded[0][:, column].tolist()
         for name, path in tracks.items():
-            at = path.times[:, column]
-            trajectory = Trajectory(at, path.poses[:, :3], path.poses[:, 3:])
-            write_trajectory(folder / name, trajectory, name.removesuffix(".txt"))
+            write_trajectory(folder / name, path.times[:, column], path.poses, name.removesuffix(".txt"))
             about.append(path.about)
     return list(zip(stamps, files, strict=True)), Extracted(folder, ", ".join(about), bag.doubts, bag.pose_fault)
 

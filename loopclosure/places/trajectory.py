@@ -1,6 +1,6 @@
 """Camera poses in time, and writing them in the form of the TUM RGB-D benchmark.
 
-A pose is camera-to-world: the position of the optical center in meters and a unit quaternion with w last; the camera
+A pose (7,), tx ty tz qx qy qz qw, is camera-to-world: the optical center in meters and a unit quaternion; the camera
 looks along its +z, x to the right, y down. Stamps are in seconds.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,40 +22,6 @@ GAP_S = 0.5  # no pose is taken between two that are further apart
 # A step is a jump if it is longer than this, and so many times as fast as nine of ten others. Moves below LEAST_M are
 # noise of a robot that stands.
 JUMP_M, JUMP_FACTOR, LEAST_M = 0.5, 10.0, 0.01
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Poses without a time: ``positions`` (..., 3) in meters, ``quaternions`` (..., 4) xyzw of unit length."""
-
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def __getitem__(self, index: int | slice | NDArray) -> Poses:
-        return Poses(self.positions[index], self.quaternions[index])
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Poses in time: ``stamps`` (N,) in s, ascending; ``positions`` (N, 3) in meters; ``quaternions`` (N, 4) xyzw."""
-
-    stamps: NDArray[np.float64]
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    @property
-    def poses(self) -> Poses:
-        """The N poses without their time."""
-        return Poses(self.positions, self.quaternions)
-
-
-Posed = Poses | Trajectory
 
 
 def inverse(poses: np.ndarray) -> np.ndarray:
@@ -146,9 +111,11 @@ def write_rgb_list(
     _write(path, what, "timestamp filename", rows)
 
 
-def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory, what: str = "ground truth") -> None:
-    """Write poses in TUM's form with its three comment lines; meters and quaternions with six decimals."""
-    table = np.column_stack([trajectory.stamps, trajectory.positions, trajectory.quaternions])
+def write_trajectory(
+    path: str | os.PathLike[str], stamps: np.ndarray, poses: np.ndarray, what: str = "ground truth"
+) -> None:
+    """Write poses (N, 7) with their stamps (N,) in TUM's form with its three comment lines, with six decimals."""
+    table = np.column_stack([stamps, poses])
     rows = (" ".join(f"{value:.6f}" for value in row) for row in table)
     _write(path, f"{what} trajectory", "timestamp tx ty tz qx qy qz qw", rows)
 

@@ -10,7 +10,6 @@ from loopclosure.errors import InputError
 from loopclosure.places.pose_files import read_poses
 from loopclosure.places.sequences import read_sequence
 from loopclosure.places.trajectory import (
-    Trajectory,
     associate,
     at,
     pieces,
@@ -21,9 +20,8 @@ from netspec.errors import SpecError
 from paths import shared
 
 
-def trajectory_at(*stamps: float) -> Trajectory:
-    count = len(stamps)
-    return Trajectory(np.array(stamps), np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+def write_poses(path: Path, *stamps: float) -> None:
+    write_trajectory(path, np.array(stamps), np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(stamps), 1)))
 
 
 def pictures(folder: Path, *names: str) -> None:
@@ -51,7 +49,7 @@ def test_missing_depth_images_are_a_warning(tmp_path: Path) -> None:
     pictures(tmp_path, "a.png")
     write(tmp_path / "rgb.txt", "1.0 rgb/a.png\n")
     write(tmp_path / "depth.txt", "1.0 depth/a.png\n")
-    write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    write_poses(tmp_path / "groundtruth.txt", 1.0, 2.0)
     sequence = read_sequence(tmp_path)
     assert sequence.depths is None
     assert sequence.doubts[-1].endswith(f'no such image "depth/a.png" in {tmp_path}; depth is not used')
@@ -124,7 +122,7 @@ def test_frames_without_a_pose_are_counted_and_omitted(tmp_path: Path) -> None:
     frames = [(stamp, f"rgb/{stamp:g}.png") for stamp in (1.0, 1.01, 5.0, 2.0)]
     pictures(tmp_path, *(Path(name).name for _, name in frames))
     write_rgb_list(tmp_path / "rgb.txt", frames)
-    write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    write_poses(tmp_path / "groundtruth.txt", 1.0, 2.0)
     every = read_sequence(tmp_path, "tum")
     sequence = every.with_poses()
     assert sequence.name == tmp_path.name
@@ -138,7 +136,7 @@ def test_frames_without_a_pose_are_counted_and_omitted(tmp_path: Path) -> None:
 def test_an_error_without_poses_has_both_time_spans(tmp_path: Path) -> None:
     pictures(tmp_path, "a.png")
     write_rgb_list(tmp_path / "rgb.txt", [(100.0, "rgb/a.png")])
-    write_trajectory(tmp_path / "groundtruth.txt", trajectory_at(1.0, 2.0))
+    write_poses(tmp_path / "groundtruth.txt", 1.0, 2.0)
     with pytest.raises(InputError, match=r"images from 100\.000 to 100\.000 s, poses from 1\.000 to 2\.000 s"):
         read_sequence(tmp_path, "tum").with_poses()
 
@@ -147,15 +145,14 @@ def test_written_lists_can_be_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     quaternions = rng.normal(size=(20, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    written = Trajectory(1e9 + np.arange(20) / 97, rng.normal(size=(20, 3)), quaternions)
+    stamps, poses = 1e9 + np.arange(20) / 97, np.hstack([rng.normal(size=(20, 3)), quaternions])
     folder = tmp_path / "caf\udce9"  # a name that is not UTF-8
     folder.mkdir()
-    write_trajectory(folder / "groundtruth.txt", written)
+    write_trajectory(folder / "groundtruth.txt", stamps, poses)
     back = read_poses(folder / "groundtruth.txt")
     assert back.stamps is not None
-    np.testing.assert_allclose(back.stamps, written.stamps, atol=1e-6)
-    np.testing.assert_allclose(back.poses[:, :3], written.positions, atol=1e-6)
-    np.testing.assert_allclose(back.poses[:, 3:], written.quaternions, atol=2e-6)
+    np.testing.assert_allclose(back.stamps, stamps, atol=1e-6)
+    np.testing.assert_allclose(back.poses, poses, atol=2e-6)
 
 
 @pytest.mark.parametrize(("name", "posed", "listed"), [("xyz", 796, 798), ("rpy", 721, 723)])
@@ -164,4 +161,4 @@ def test_tum_fr1_has_the_poses_its_readme_counts(name: str, posed: int, listed: 
     sequence = read_sequence(folder, "tum", 0.03)
     poses = sequence.with_poses().known_poses()
     assert (len(poses), len(sequence)) == (posed, listed)
-    np.testing.assert_allclose(np.linalg.norm(poses.quaternions, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(poses[:, 3:], axis=1), 1, atol=1e-12)
