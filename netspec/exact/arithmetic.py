@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import torch
 from torch.nn import functional as F
@@ -94,7 +93,7 @@ class AsTorch:
         """Cross-correlate maps (N, C, ...) with filters (num_output, C / group, kernel), and add the bias."""
         if sliding.reads_padding_alone:
             maps = F.pad(maps, [p for p in reversed(sliding.pad) for _ in range(2)])
-            sliding = replace(sliding, pad=(0,) * len(sliding.pad))
+            sliding = sliding._replace(pad=(0,) * len(sliding.pad))
         if not torch.is_grad_enabled():  # in channels_last, weights would be copied for each product
             return convolution(of_one_channel(maps), weight, bias, sliding, group)
         in_channels = maps.numel() > 2 * weight.numel() or is_rounded(weight)

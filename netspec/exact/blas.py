@@ -29,15 +29,15 @@ CORE_TYPE = "OPENBLAS_CORETYPE"  # the environment variable by which OpenBLAS ch
 
 
 @cache
-def _library(name: str) -> Any:
-    """Return SciPy's BLAS, ``_fblas`` for arrays or ``cython_blas`` for addresses, with Caffe's kernels, for AVX-512.
+def _library() -> Any:
+    """Return SciPy's BLAS for addresses, with Caffe's kernels, for AVX-512.
 
     OpenBLAS chooses others on some newer CPUs. A choice in the environment is kept, and so are the kernels of a BLAS of
     SciPy that was loaded before. Only this module of ``scipy.linalg`` is loaded, because all of it takes ten times as
     long. It is removed from ``sys.modules``; otherwise a later import of ``scipy.linalg`` would lack it as an
     attribute.
     """
-    name = f"scipy.linalg.{name}"
+    name = "scipy.linalg.cython_blas"
     if name in sys.modules:
         return sys.modules[name]
     spec = PathFinder.find_spec(name, [f"{folder}/linalg" for folder in scipy.__path__])
@@ -76,11 +76,6 @@ def is_recorded() -> bool:
 def array(values: torch.Tensor) -> np.ndarray:
     """Return values on the CPU as an array that shares their memory."""
     return values.detach().numpy()
-
-
-def routine(name: str, values: np.ndarray) -> Callable[..., Any]:
-    """Return SciPy's function for a routine of BLAS, e.g. "dot", for numbers of this type."""
-    return getattr(_library("_fblas"), values.dtype.char.replace("f", "s") + name)
 
 
 def gemm(
@@ -151,19 +146,20 @@ def _gemv(
 
 
 _NUMBERS = {torch.float32: ctypes.c_float, torch.float64: ctypes.c_double}
-_ARGUMENTS = {"gemm": 13, "gemv": 11}
+_ARGUMENTS = {"gemm": 13, "gemv": 11, "dot": 5, "asum": 3}
 
 
 @cache
-def _function(name: str, dtype: torch.dtype) -> Callable[..., None]:
-    """Return a Fortran routine of SciPy's BLAS. Its arguments are addresses."""
-    capsule = _library("cython_blas").__pyx_capi__[("s" if dtype == torch.float32 else "d") + name]
+def _function(name: str, dtype: torch.dtype) -> Callable[..., Any]:
+    """Return a Fortran routine of SciPy's BLAS. Its arguments are addresses; dot and asum return a number."""
+    capsule = _library().__pyx_capi__[("s" if dtype == torch.float32 else "d") + name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
     api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
     address = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
-    return ctypes.PYFUNCTYPE(None, *[ctypes.c_void_p] * _ARGUMENTS[name])(address)
+    result = _NUMBERS[dtype] if name in ("dot", "asum") else None
+    return ctypes.PYFUNCTYPE(result, *[ctypes.c_void_p] * _ARGUMENTS[name])(address)
 
 
 def _count(*matrices: torch.Tensor) -> int:
@@ -188,8 +184,7 @@ def _step(matrices: torch.Tensor) -> int:
 
 def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the sum of the products of two tensors of equal counts, () (caffe_cpu_dot)."""
-    first, second = array(a).reshape(-1), array(b).reshape(-1)
-    return a.new_tensor(routine("dot", first)(first, second))
+    return dots(a.reshape(1, -1, 1), b.reshape(1, -1, 1)).view(())
 
 
 def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -197,17 +192,21 @@ def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     count, length, stride = a.shape
     if stride == 1 and length < _IN_DOUBLE:
         return sum_in_order((a * b).double(), 1).to(a.dtype)
-    flat = [array(values.contiguous()).reshape(-1) for values in (a, b)]
-    call = routine("dot", flat[0])
-    starts = (n * length * stride + m for n in range(count) for m in range(stride))
-    found = [call(*flat, n=length, offx=k, incx=stride, offy=k, incy=stride) for k in starts]
+    a, b, call = a.contiguous(), b.contiguous(), _function("dot", a.dtype)
+    numbers = ctypes.c_int(length), ctypes.c_int(stride)
+    at_length, at_step = map(ctypes.addressof, numbers)
+    first, second, size = a.data_ptr(), b.data_ptr(), a.element_size()
+    starts = (size * (n * length * stride + m) for n in range(count) for m in range(stride))
+    found = [call(at_length, first + start, at_step, second + start, at_step) for start in starts]
     return a.new_tensor(found).view(count, stride)
 
 
 def sum_of_magnitudes(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of the absolute values, () (caffe_cpu_asum)."""
-    flat = array(values).reshape(-1)
-    return values.new_tensor(routine("asum", flat)(flat))
+    values = values.contiguous()
+    count, step = ctypes.c_int(values.numel()), ctypes.c_int(1)
+    call = _function("asum", values.dtype)
+    return values.new_tensor(call(ctypes.addressof(count), values.data_ptr(), ctypes.addressof(step)))
 
 
 def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
@@ -252,7 +251,7 @@ def name() -> str:
 @cache
 def _pools() -> list[Any]:
     """Return the OpenBLAS of SciPy, or every loaded one if SciPy's is not in a folder of its own."""
-    _library("_fblas")  # loads its OpenBLAS
+    _library()  # loads its OpenBLAS
     if name() == "accelerate":
         return []
     pools = ThreadpoolController().select(internal_api="openblas").lib_controllers

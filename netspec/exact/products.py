@@ -21,12 +21,11 @@ from netspec.exact.layout import by_channel
 from netspec.exact.pointwise import pointwise
 
 Axes = tuple[int, ...]
-COLUMNS = 2**20  # numbers (4 MB): the columns of several images, which fit into a CPU's cache
+COLUMNS = 2**19  # numbers (2 MB): the columns of several images, which fit into a CPU's cache
 FEWEST_VECTORS = 64  # for fewer, the product takes less time than rounding the weights to another precision
 
 
-@dataclass(frozen=True)
-class Filter:
+class Filter(NamedTuple):
     """The geometry of a filter: one number for each spatial axis.
 
     Caffe: src/caffe/util/im2col.cpp

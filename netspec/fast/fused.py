@@ -81,7 +81,7 @@ def spread_by_channel(
     how.keeps(spread.nbytes)
     pixels = spread[:, :, ::down, ::across]
     axes = zip(sliding.kernel, sliding.dilation, sliding.pad, strict=True)
-    mirrored = replace(sliding, stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
+    mirrored = sliding._replace(stride=(1, 1), pad=tuple(d * (k - 1) - p for k, d, p in axes))
     own_names = replace(how, memo=lambda name, make: how.memo(f"mirrored {name}", make))
     convolve = convolution(spread_shape, values_of(weight).flip(2, 3), bias, mirrored, channels, own_names)
 

@@ -64,6 +64,7 @@ def make_solver(
 class Solver(Training):
     """A training: the loop, its updates, tests and snapshots. Only the solver changes its fields."""
 
+    _is_complete = False
     _overflowed = False
     _before_test: tuple[Remembered, ...] = ()  # the running states of the test nets before the current test
 
@@ -71,6 +72,13 @@ class Solver(Training):
         super().__init__(*arguments, **named)
         self._display = Display(self.net)
         log.info("solver.cpp:57", "Solver scaffolding done.")
+        self._is_complete = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Raise AttributeError for a name that no part of a solver reads: the settings are those of ``param``."""
+        if self._is_complete and not hasattr(self, name):
+            raise AttributeError(f"a Solver has no {name}; its settings are in param, as param.base_lr")
+        super().__setattr__(name, value)
 
     @property
     def learning_rate(self) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -34,9 +35,10 @@ Outputs = dict[str, torch.Tensor]
 class _Training(core_solver.Solver):
     """A training whose nets run through the memory of their blobs."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.shown = {net: Net.of(net) for net in (self.net, *self.test_nets)}
+    @cached_property
+    def shown(self) -> dict[core.Net, Net]:
+        """The nets as scripts see them."""
+        return {net: Net.of(net) for net in (self.net, *self.test_nets)}
 
     @override
     def check_inputs(self) -> None:

@@ -49,6 +49,14 @@ def weights(solver: Solver) -> list[torch.Tensor]:
     return [item.parameter.detach().clone() for item in solver.net.learnable]
 
 
+def test_setting_an_attribute_that_nothing_reads_is_refused(make: Callable[..., Solver]) -> None:
+    solver = make()
+    with pytest.raises(AttributeError, match="a Solver has no base_lr; its settings are in param"):
+        solver.base_lr = 0.5
+    solver.param.base_lr = 0.5
+    assert solver.learning_rate == 0.5
+
+
 # When it tests
 
 
