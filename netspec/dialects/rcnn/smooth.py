@@ -59,7 +59,7 @@ class SmoothL1Loss(Loss):
                 "found outside weights, which R-FCN's loss (loss_param, a second top) has not", "bottom", 3
             )
         sigma = 1.0 if self.by_pixel else value(self.param, "smooth_l1_loss_param").sigma
-        if sigma <= 0:
+        if not sigma > 0:
             raise self.error(f"sigma must be above 0, found {sigma:g}", "smooth_l1_loss_param", "sigma")
         self.knee = 1 / (sigma * sigma)
 

@@ -81,7 +81,7 @@ class CTCGreedyDecoder(Layer):
                 row[: len(text), 0, 0] = torch.tensor(text, dtype=top.dtype)
             return top
         wrong, right = 0.0, 0
-        for text, row in zip(found, labels[0].flatten(1).tolist(), strict=True):
+        for text, row in zip(found, labels[0].reshape(len(found), -1).tolist(), strict=True):
             ended = next((i for i, label in enumerate(row) if label < 0), len(row))
             true = [int(label + 0.5) for label in row[:ended] if int(label + 0.5) != blank]
             if true or text:
@@ -117,7 +117,7 @@ class LabelsequenceAccuracy(Layer):
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         blank = value(self.param, "labelsequence_accuracy_param").blank_label
-        paths, texts = first_maxima(scores.flatten(2)).tolist(), labels.flatten(1).long().tolist()
+        paths, texts = first_maxima(scores.flatten(2)).tolist(), labels.reshape(len(labels), -1).long().tolist()
         right = [
             _collapsed(path, blank, True) == [label for label in text if label != blank]
             for path, text in zip(paths, texts, strict=True)
@@ -139,8 +139,10 @@ class _CtcLoss(Layer):
         """
         scores = scores.flatten(2)
         classes, labels = scores.shape[2], [label for text in texts for label in text]
-        if wrong := [label for label in labels if not 0 <= label < classes]:
+        if wrong := [label for label in (*labels, blank) if not 0 <= label < classes]:
             raise self.error(f"found label {wrong[0]}, expected 0 to {classes - 1}", "bottom")
+        if wrong := [count for count in steps if not 0 <= count <= len(scores)]:
+            raise self.error(f"found {wrong[0]} steps, expected 0 to {len(scores)}", "bottom")
         flat = torch.tensor(labels, dtype=torch.long, device=scores.device)
         sizes: Any = list(steps), [len(text) for text in texts]
         total = F.ctc_loss(F.log_softmax(scores, 2), flat, sizes[0], sizes[1], blank, "sum", zero_infinity=True)
@@ -234,5 +236,7 @@ class CtcLoss(_CtcLoss):
 
     def forward(self, scores: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
         blank = self.settings.blank_label
-        texts = [[int(label) for label in row if int(label) != blank] for row in labels.flatten(1).tolist()]
+        texts = [
+            [int(label) for label in row if int(label) != blank] for row in labels.reshape(len(labels), -1).tolist()
+        ]
         return self.loss(scores, texts, [self.settings.time_step] * len(texts), blank)

@@ -83,10 +83,27 @@ def test_lstm_state_continues_where_the_second_bottom_is_one(build: Build) -> No
     assert whole.running_state() == {}
 
 
-def test_an_invalid_label_is_refused(build: Build) -> None:
-    layer = build("text", "type: 'CTCLoss'", (4, 2, 3), (2, 2))
-    with pytest.raises(SpecError, match="found label 3, expected 0 to 2"):
-        layer.run(torch.zeros(4, 2, 3), torch.tensor([[1.0, 3], [1, 1]]))
+@pytest.mark.parametrize(
+    ("line", "others", "fault"),
+    [
+        ("", [[[1.0, 3], [1, 1]]], "label 3, expected 0 to 2"),
+        ("ctc_loss_param { blank_index: 3 }", [[[1.0], [1]]], "label 3, expected 0 to 2"),
+        ("", [[9.0, 2], [1, 1], [[1, 1], [1, 1]]], "9 steps, expected 0 to 4"),
+    ],
+    ids=["label", "blank", "steps"],
+)
+def test_invalid_labels_and_steps_are_refused(line: str, others: list[object], fault: str, build: Build) -> None:
+    bottoms = [torch.zeros(4, 2, 3), *map(torch.tensor, others)]
+    layer = build("text", f"type: 'CTCLoss' {line}", *(tuple(each.shape) for each in bottoms))
+    with pytest.raises(SpecError, match=f"found {fault}"):
+        layer.run(*bottoms)
+
+
+def test_labels_of_one_axis_are_texts_of_one_letter(build: Build) -> None:
+    scores, labels = torch.randn(4, 2, 3), torch.tensor([1.0, 2.0])
+    line = "type: 'CtcLoss' ctc_loss_param { alphabet_size: 3 time_step: 4 blank_label: 0 }"
+    tops = [build("text", line, (4, 2, 3), shape).run(scores, labels.view(shape))[0] for shape in ((2,), (2, 1))]
+    assert torch.equal(*tops)
 
 
 @pytest.mark.parametrize("items", [1, 2])
