@@ -112,7 +112,8 @@ class ArgMax(Layer):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, shape = self.param.argmax_param, bottom_shapes[0]
-        self.axis = self.canonical_axis(p.axis, shape, "argmax_param", "axis") if p.HasField("axis") else None
+        axis = self.canonical_axis(p.axis, shape, "argmax_param", "axis")
+        self.axis = axis if p.HasField("axis") else None
         size = math.prod(shape[1:]) if self.axis is None else shape[self.axis]
         if not 1 <= p.top_k <= size:
             raise self.error(f"found top_k {p.top_k}, expected 1 to {size}", "argmax_param", "top_k")

@@ -144,6 +144,7 @@ class BatchReindex(Layer):
 
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         data, indices = bottom_shapes
+        self.canonical_axis(0, data, "bottom", 0)
         if len(indices) != 1:
             raise self.error(f"found indices of shape {indices}, expected one axis", "bottom", 1)
         return [(*indices, *data[1:])]
