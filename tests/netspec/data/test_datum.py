@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from netspec.data.datum import array_to_datum, datum_to_array, encoded_datum, parse_datum, planar
+from netspec.data.datum import array_to_datum, datum_to_array, encoded_datum
 from netspec.proto.schema import Datum
 
 COLORS = np.random.default_rng(0).integers(0, 256, (3, 5, 7), np.uint8)
@@ -12,15 +12,6 @@ COLORS = np.random.default_rng(0).integers(0, 256, (3, 5, 7), np.uint8)
 
 def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image.transpose(1, 2, 0))[1].tobytes()
-
-
-def test_uint8_is_stored_in_data() -> None:
-    datum = parse_datum(array_to_datum(COLORS, 3).SerializeToString())
-    assert (datum.channels, datum.height, datum.width, datum.label) == (3, 5, 7, 3)
-    assert not datum.float_data
-    found = datum_to_array(datum)
-    assert found.dtype == np.uint8
-    assert (found == COLORS).all()
 
 
 def test_floats_are_stored_in_float_data() -> None:
@@ -52,11 +43,6 @@ def test_a_gray_file_stays_gray_unless_color_is_forced() -> None:
     assert (datum_to_array(datum, color=True) == COLORS[[0, 0, 0]]).all()
 
 
-def test_planar_accepts_gray_and_color() -> None:
-    assert planar(np.zeros((4, 5), np.uint8)).shape == (1, 4, 5)
-    assert planar(np.zeros((4, 5, 3), np.uint8)).shape == (3, 4, 5)
-
-
 @pytest.mark.parametrize(
     ("datum", "message"),
     [
@@ -71,11 +57,6 @@ def test_planar_accepts_gray_and_color() -> None:
 def test_contradictions_are_reported(datum: Datum, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         datum_to_array(datum)
-
-
-def test_an_invalid_datum_is_refused() -> None:
-    with pytest.raises(ValueError, match="is not a Datum"):
-        parse_datum(b"\xff\xff\xff")
 
 
 def test_an_array_needs_three_axes() -> None:

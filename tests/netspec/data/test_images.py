@@ -2,40 +2,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from netspec.data.images import list_lines, read_image, read_image_list
 from netspec.errors import SpecError, Where
-from paths import GOLDEN
-
-PNG = GOLDEN / "images" / "png"
-
-
-def test_an_image_is_planar_and_blue_green_red() -> None:
-    image = read_image(str(PNG / "0.png"))
-    assert image.shape == (3, 48, 64)
-    assert image.flags.c_contiguous
-    assert (image.transpose(1, 2, 0) == cv2.imread(str(PNG / "0.png"))).all()
-
-
-def test_an_image_is_resized_without_antialiasing(tmp_path: Path) -> None:
-    found = read_image(str(PNG / "0.png"), size=(12, 16))
-    whole = cv2.imread(str(PNG / "0.png"))
-    assert whole is not None
-    assert (found.transpose(1, 2, 0) == cv2.resize(whole, (16, 12))).all()
-    stripes = np.zeros((8, 2), np.uint8)
-    stripes[::4] = (
-        255  # bilinear looks between rows 1 and 2, 5 and 6; an average over the area would see the bright ones
-    )
-    cv2.imwrite(str(tmp_path / "stripes.png"), stripes)
-    assert not read_image(str(tmp_path / "stripes.png"), size=(2, 2)).any()
-
-
-def test_a_gray_image_has_one_channel_also_when_resized() -> None:
-    assert read_image(str(PNG / "0.png"), color=False).shape == (1, 48, 64)
-    assert read_image(str(PNG / "0.png"), color=False, size=(5, 6)).shape == (1, 5, 6)
 
 
 def test_missing_and_damaged_images_are_distinguished(tmp_path: Path) -> None:
