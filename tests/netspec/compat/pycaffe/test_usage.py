@@ -1,24 +1,21 @@
-"""Every way in which public scripts use pycaffe: each a few lines of code that must run.
+"""Every way in which public scripts use nets and solvers: each a few lines of code that must run.
 
-The names are those of a count over 493 public scripts. Not there is what single forks have in modules of
-their own (caffe.tools, caffe.mpi_init and the like).
+The names are those of a count over 493 public scripts. What they use around them has tests of its own: test_io,
+test_caffe_pb2, test_classifier, test_net_spec and others.
 """
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import netspec.pycaffe as caffe
-from netspec import use_dialect
-from netspec.compat.scripts import finder
 
 pytestmark = pytest.mark.slow
 
 NETS = Path(__file__).parent / "nets"
-USES = {  # what scripts do with nets and solvers, by the names of the count
+USES = {
     "import caffe": "import netspec.pycaffe as caffe",
     "caffe.Net": "assert isinstance(net, caffe.Net)",
     "caffe.TEST": "assert caffe.TEST == 1",
@@ -117,91 +114,6 @@ import netspec.compat.pycaffe._caffe as _caffe; assert isinstance(net.params['fc
     "._layer_names[i]": "assert net._layer_names[1] == 'conv1'",
     "._blob_names[i]": "assert net._blob_names[4] == 'prob'",
 }
-BEFORE = """
-import numpy as np
-import caffe
-from caffe import layers as L, params as P
-from caffe.proto import caffe_pb2
-net = caffe.Net('deploy.prototxt', caffe.TEST)
-transformer = caffe.io.Transformer({'data': net.blobs['data'].data.shape})
-image = np.random.rand(8, 6, 3)
-"""
-AROUND = {  # and around them, each after BEFORE
-    "from caffe.proto import caffe_pb2": "assert caffe_pb2.NetParameter is caffe.proto.caffe_pb2.NetParameter",
-    "import caffe.proto.caffe_pb2": "import caffe.proto.caffe_pb2; caffe.proto.caffe_pb2.NetParameter()",
-    "from caffe.proto.caffe_pb2 import NetParameter": "from caffe.proto.caffe_pb2 import NetParameter; NetParameter()",
-    "from caffe.proto.caffe_pb2 import LayerParameter": "from caffe.proto.caffe_pb2 import LayerParameter",
-    "caffe.proto.caffe_pb2": "assert caffe.proto.caffe_pb2.__name__.endswith('caffe_pb2')",
-    "caffe.proto.caffe_pb2.NetParameter": """
-from google.protobuf import text_format
-p = caffe_pb2.NetParameter(); text_format.Merge(open('deploy.prototxt').read(), p)
-assert [layer.name for layer in p.layer] == ['data', 'pool']
-""",
-    "caffe.proto.caffe_pb2.BlobProto": "b = caffe_pb2.BlobProto(); b.data.extend([1, 2]); b.shape.dim.extend([2])",
-    "caffe.proto.caffe_pb2.SolverParameter": "s = caffe_pb2.SolverParameter(); s.base_lr = 0.1; s.test_iter.append(3)",
-    "caffe.proto.caffe_pb2.SolverParameter.GPU": "assert caffe_pb2.SolverParameter.GPU == 1",
-    "caffe.proto.caffe_pb2.Datum": "d = caffe_pb2.Datum(); d.ParseFromString(caffe_pb2.Datum().SerializeToString())",
-    "caffe.proto.caffe_pb2.Datum.FromString": "assert caffe_pb2.Datum.FromString(b'').label == 0",
-    "caffe.proto.caffe_pb2.LayerParameter": "caffe_pb2.LayerParameter(name='x', bottom=['a'])",
-    "caffe.proto.caffe_pb2.ParamSpec": "assert caffe_pb2.ParamSpec(lr_mult=2).decay_mult == 1",
-    "caffe.proto.caffe_pb2.TRAIN": "assert caffe_pb2.TRAIN == caffe.TRAIN",
-    "caffe.proto.caffe_pb2.TEST": "assert caffe_pb2.TEST == caffe.TEST",
-    "caffe.proto.caffe_pb2.Phase.Value": "assert caffe_pb2.Phase.Value('TEST') == 1",
-    "caffe.proto.caffe_pb2.DataParameter.LMDB": "assert caffe_pb2.DataParameter.LMDB == P.Data.LMDB",
-    "caffe.proto.caffe_pb2.PoolingParameter.AVE": "assert caffe_pb2.PoolingParameter.AVE == P.Pooling.AVE",
-    "caffe.proto.caffe_pb2.LabelMap": "m = caffe_pb2.LabelMap(); m.item.add(name='n', label=1, display_name='d')",
-    "caffe.proto.caffe_pb2.BNParameter.INFERENCE": "assert caffe_pb2.BNParameter.INFERENCE == 1",
-    "caffe.io.load_image": "assert caffe.io.load_image('image.png').shape == (8, 6, 3)",
-    "caffe.io.resize_image": "assert caffe.io.resize_image(image, (4, 4)).shape == (4, 4, 3)",
-    "caffe.io.resize": "assert caffe.io.resize(image, (4, 4)).shape == (4, 4, 3)",
-    "caffe.io.oversample": "assert caffe.io.oversample([image], (4, 4)).shape == (10, 4, 4, 3)",
-    "caffe.io.array_to_datum": "assert caffe.io.array_to_datum(image.transpose(2, 0, 1), 1).label == 1",
-    "caffe.io.datum_to_array": "assert caffe.io.datum_to_array(caffe.io.array_to_datum(image)).shape == image.shape",
-    "caffe.io.blobproto_to_array": """
-b = caffe_pb2.BlobProto(data=[1, 2], num=1, channels=2, height=1, width=1)
-assert caffe.io.blobproto_to_array(b)[0].mean(1).mean(1).tolist() == [1, 2]
-""",
-    "caffe.io.caffe_pb2.BlobProto.FromString": "assert not caffe.io.caffe_pb2.BlobProto.FromString(b'').data",
-    "caffe.io.Transformer": "assert transformer.inputs['data'] == (2, 3, 8, 6)",
-    ".set_transpose(..)": "transformer.set_transpose('data', (2, 0, 1))",
-    ".set_mean(..)": "transformer.set_mean('data', np.array([104, 117, 123]))",
-    ".set_channel_swap(..)": "transformer.set_channel_swap('data', (2, 1, 0))",
-    ".set_raw_scale(..)": "transformer.set_raw_scale('data', 255)",
-    ".set_input_scale(..)": "transformer.set_input_scale('data', 0.017)",
-    ".preprocess(..)": """
-transformer.set_transpose('data', (2, 0, 1))
-net.blobs['data'].data[...] = transformer.preprocess('data', image)
-assert np.allclose(net.forward()['prob'][1, :, 0, 0], image.mean((0, 1)), rtol=1e-5)
-""",
-    ".deprocess(..)": """
-transformer.set_transpose('data', (2, 0, 1))
-assert transformer.deprocess('data', net.blobs['data'].data[0]).shape == (8, 6, 3)
-""",
-    "caffe.Classifier": "caffe.Classifier('deploy.prototxt', 'net.caffemodel', mean=np.ones(3), image_dims=(9, 9))",
-    ".predict(..)": "assert len(caffe.Classifier('deploy.prototxt', 'net.caffemodel').predict([image], False)) == 1",
-    "from caffe import params": "from caffe import params as P; assert P.Pooling.MAX == 0",
-    "from caffe import layers": "from caffe import layers as L; L.ReLU(L.Input())",
-    "caffe.layers.<Type>": "assert caffe.layers.ReLU(caffe.layers.Input()).fn.type_name == 'ReLU'",
-    "caffe.params.<X>": "assert caffe.params.Eltwise.SUM == 1",
-    "caffe.NetSpec": "n = caffe.NetSpec(); n.data = L.Input(); assert n.to_proto().layer[0].name == 'data'",
-    ".to_proto(..)": "assert L.ReLU(L.Input()).to_proto().layer[1].type == 'ReLU'",
-    "from caffe import to_proto": "from caffe import to_proto; assert len(to_proto(L.Input()).layer) == 1",
-    "caffe.to_proto": "assert 'type: \"Input\"' in str(caffe.to_proto(L.Input()))",
-    "from caffe.coord_map import crop": "from caffe.coord_map import crop",
-    "caffe.coord_map.crop": """
-data = L.Input(); up = L.Deconvolution(L.Pooling(data, kernel_size=2, stride=2), kernel_size=4, stride=2)
-import caffe.coord_map
-assert caffe.coord_map.crop(up, data).fn.params['crop_param']['offset'] == [1]
-""",
-    "import caffe.draw": "import caffe.draw; caffe.draw.draw_net_to_file",
-    "caffe.draw.draw_net_to_file": """
-import caffe.draw
-caffe.draw.draw_net_to_file(L.ReLU(L.Input()).to_proto(), 'net.dot', 'TB')
-""",
-    ".param_str": "p = L.Python(param_str='{}').to_proto().layer[0]; assert p.python_param.param_str == '{}'",
-    "caffe._caffe.BlobVec": "import caffe._caffe; caffe._caffe.BlobVec",
-    "import caffe": "import caffe; assert caffe.__name__ == 'netspec.compat.pycaffe'",
-}
 
 
 @pytest.mark.parametrize("use", USES)
@@ -221,26 +133,3 @@ def test_typical_uses_of_nets_and_solvers(use: str, write: Callable[..., str]) -
         "ones": np.ones((2, 5), np.float32),
     }
     exec(USES[use], names)
-
-
-@pytest.fixture
-def as_in_netspec_run(write: Callable[..., str]) -> Iterator[None]:
-    """Let ``import caffe`` find netspec, in a folder with a net, its weights and an image."""
-    cv2 = pytest.importorskip("cv2")
-    write((NETS / "usage_pool.prototxt").read_text(), "deploy.prototxt")
-    caffe.Net("deploy.prototxt", caffe.TEST).save("net.caffemodel")
-    cv2.imwrite("image.png", np.zeros((8, 6, 3), np.uint8))
-    use_dialect("ssd")
-    use_dialect("blocks")
-    finder.install()
-    yield
-    finder.uninstall()
-    for name in [name for name in sys.modules if name == "caffe" or name.startswith("caffe.")]:
-        del sys.modules[name]
-
-
-@pytest.mark.parametrize("use", AROUND)
-def test_typical_uses_of_other_functions(use: str, as_in_netspec_run: None) -> None:
-    if any(word in AROUND[use] for word in ("load_image", "resize", "Classifier")):
-        pytest.importorskip("skimage")
-    exec(BEFORE + AROUND[use], {})
