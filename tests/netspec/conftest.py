@@ -25,6 +25,11 @@ from netspec.proto.text import parse_net_text
 from paths import GOLDEN
 
 
+@pytest.fixture(autouse=True)
+def _the_same_numbers_in_every_run() -> None:
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def caffes_bits() -> bool:
     """Whether BLAS and the C library compute the bits of those with which Caffe computed the golden files.

@@ -12,11 +12,6 @@ from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 @pytest.fixture
 def build() -> Callable[..., Layer]:
     """``build(dialect, text, *bottom_shapes, phase=TEST, tops=1)``: a layer from the text of a LayerParameter.

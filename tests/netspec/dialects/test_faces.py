@@ -15,7 +15,6 @@ MAP = [[[[1.0, 2], [3, 4]]]]
 
 @pytest.fixture(autouse=True)
 def of_faces() -> None:
-    torch.manual_seed(0)
     for dialect in ("faces", "happynear", "flownet", "blocks"):
         netspec.use_dialect(dialect)
 

@@ -4,18 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-import torch
 
 from contexts import context
 from netspec.errors import Where
 from netspec.layers import Layer, Random
 from netspec.net.one_layer import make_layer
 from netspec.proto.schema import TEST
-
-
-@pytest.fixture(autouse=True)
-def _seeded() -> None:
-    torch.manual_seed(0)
 
 
 @pytest.fixture(params=["none", "all"])
