@@ -196,8 +196,10 @@ def _nearest_depths(listing: Path, stamps: np.ndarray, max_difference: float) ->
     depths = list_images(listing)
     if depths.stamps is None:
         raise InputError('has lines without a time stamp; expected "timestamp filename" in each line', listing)
-    nearest = associate(stamps, seconds_of(depths.stamps), max_difference)
-    return tuple(None if number < 0 else depths.paths[number] for number in nearest)
+    times = seconds_of(depths.stamps)
+    order = np.argsort(times, kind="stable")
+    nearest = associate(stamps, times[order], max_difference)
+    return tuple(None if number < 0 else depths.paths[order[number]] for number in nearest)
 
 
 def _images(source: Path, max_difference: float, own_poses: bool) -> ImageSequence:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from netspec.errors import Code, ForkFault, SpecError
 from netspec.graph.options import BuildOptions
@@ -41,7 +41,13 @@ def gathered(faults: Sequence[SpecError]) -> list[SpecError]:
         file = fault.where.file if fault.where else ""
         key = (file, fault.message) if isinstance(fault, ForkFault) else fault
         groups.setdefault(key, []).append(fault)
-    return [_as_one(group) for group in groups.values()]
+    found = []
+    for first, *more in groups.values():
+        lines = list(dict.fromkeys(fault.where.line for fault in more if fault.where))
+        named = ", ".join(map(str, lines[:MOST_LINES])) + (" and more" if len(lines) > MOST_LINES else "")
+        also = f" (also in {'line' if len(lines) == 1 else 'lines'} {named})"
+        found.append(SpecError(first.message + also, first.where) if more else first)
+    return found
 
 
 def others(faults: Sequence[SpecError], unknown: Sequence[SpecError]) -> list[SpecError]:
@@ -49,14 +55,3 @@ def others(faults: Sequence[SpecError], unknown: Sequence[SpecError]) -> list[Sp
     positions = {(fault.where.file, fault.where.layer) for fault in unknown if fault.where and fault.where.layer}
     own = [fault for fault in faults if fault.where and (fault.where.file, fault.where.layer) in positions]
     return [fault for fault in faults if fault not in own or fault.code is Code.UNKNOWN_BOTTOM]
-
-
-def _as_one(faults: list[SpecError]) -> SpecError:
-    first = faults[0]
-    return SpecError(f"{first.message} ({_also_in(faults[1:])})", first.where) if len(faults) > 1 else first
-
-
-def _also_in(faults: Iterable[SpecError]) -> str:
-    lines = list(dict.fromkeys(fault.where.line for fault in faults if fault.where))
-    named = ", ".join(map(str, lines[:MOST_LINES])) + (" and more" if len(lines) > MOST_LINES else "")
-    return f"also in {'line' if len(lines) == 1 else 'lines'} {named}"

@@ -10,7 +10,7 @@ from netspec.graph.options import BuildOptions
 from netspec.inspect.check.check import ON_META, Checked, check_file
 from netspec.inspect.check.findings import Finding
 from netspec.net.net import Net
-from netspec.proto.schema import TEST, TRAIN, PhaseValue
+from netspec.proto.schema import TEST, TRAIN
 
 
 @dataclass
@@ -33,13 +33,9 @@ def lint_file(path: str | Path, options: BuildOptions = ON_META) -> Linted:
 
     A phase without a data layer is skipped if the other phase has one.
     """
-
-    def check(phase: PhaseValue) -> list[Checked]:
-        return check_file(path, phase, options)
-
-    parts = check(TRAIN)
+    parts = check_file(path, TRAIN, options)
     if len(parts) == 1 and parts[0].net is not None:
-        phases = [parts[0], *check(TEST)]
+        phases = [parts[0], *check_file(path, TEST, options)]
         parts = [part for part in phases if not _lacks_data(part)] or phases
     faults = {str(fault): fault for part in parts for fault in part.faults}.values()
     return Linted(

@@ -10,7 +10,7 @@ import torch
 
 from netspec.log import info, number
 from netspec.net.net import Net
-from netspec.run.walk import Step, Values, walk
+from netspec.run.walk import Step, walk
 from netspec.solver.testing import Outputs, Tally, score_lines, scorers
 
 
@@ -77,33 +77,12 @@ def _milliseconds(iterations: int, what: str, run: Callable[[], object]) -> floa
 
 
 def _pass(net: Net, forward: list[float], backward: list[float]) -> float:
-    """Run each layer forward, then each backward; add the seconds; return the loss. The inputs are zeros."""
-    given = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
-    loss = _timed(
-        net.eager.one_by_one(),
-        net.input_tensors(given),
-        net.options.exact,
-        net.backward_plan.bottoms,
-        forward,
-        backward,
-    )
-    net.zero_grad()
-    return loss
+    """Run each layer forward, then each backward on its own graph; return the loss. The inputs are zeros.
 
-
-def _timed(
-    steps: Sequence[Step],
-    values: Values,
-    exact: str,
-    wanted: Sequence[Sequence[bool]],
-    forward: list[float],
-    backward: list[float],
-) -> float:
-    """Run the steps on ``values``, then each backward on its own graph; return the weighted sum of the losses.
-
-    ``wanted[i]`` says which bottoms of layer i get a gradient. The seconds that it takes are added to ``forward[i]``
-    and ``backward[i]``.
+    The seconds of layer i are added to ``forward[i]`` and ``backward[i]``.
     """
+    given = {name: torch.zeros(net.shapes[name], device=net.device) for name in net.inputs}
+    wanted = net.backward_plan.bottoms  # for each layer, which of them get a gradient
     made: list[tuple[Step, list[torch.Tensor], tuple[torch.Tensor, ...]]] = []
 
     def visit(step: Step, bottoms: list[torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -114,7 +93,7 @@ def _timed(
         made.append((step, leaves, tops))
         return tops
 
-    loss = walk(steps, values, exact, visit)
+    loss = walk(net.eager.one_by_one(), net.input_tensors(given), net.options.exact, visit)
     gradients: dict[int, torch.Tensor] = {}
     for step, leaves, tops in reversed(made):
         weights = {loss.top: loss.weight for loss in step.losses if loss.learns}
@@ -130,6 +109,7 @@ def _timed(
         for v, leaf in zip(step.bottoms, leaves, strict=True):
             if leaf.grad is not None:
                 gradients[v] = gradients[v] + leaf.grad if v in gradients else leaf.grad
+    net.zero_grad()
     return 0.0 if loss is None else loss.item()
 
 

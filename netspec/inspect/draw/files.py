@@ -15,7 +15,6 @@ from netspec.inspect.draw.graphviz import render
 from netspec.inspect.draw.page import net_page
 from netspec.inspect.net_or_solver import parse_net_or_solver
 from netspec.proto.schema import NetParameter, PhaseValue
-from netspec.proto.source_map import SourceMap
 from netspec.solver.nets import solver_nets
 
 SLOW_TO_DRAW = 5000  # boxes; drawing them takes about half a minute
@@ -26,10 +25,15 @@ def write_picture(
 ) -> Diagram:
     """Draw the net of a file, or the training net of a solver, as SVG, PNG or HTML by the ending of ``out``.
 
-    Returns the diagram. Its faults are the errors in parts that could
-    not be built and have no shapes. Raises SpecError for a file that cannot be read, or if Graphviz is missing.
+    Returns the diagram. Its faults are the errors in parts that could not be built and have no shapes. Raises
+    SpecError for a file that cannot be read, or if Graphviz is missing.
     """
-    diagram = diagram_of(*_net_of(path), phases, options)
+    read: Any = parse_net_or_solver(path)
+    net, source = read
+    if not isinstance(net, NetParameter):
+        training = solver_nets(net, source)[0]
+        net, source = training.net, training.source
+    diagram = diagram_of(net, source, phases, options)
     if len(diagram.boxes) > SLOW_TO_DRAW:
         log.warning(
             "draw_net.py:1",
@@ -41,11 +45,3 @@ def write_picture(
         content = render(dot_of(diagram, unfolded), out.suffix[1:])
     write_whole(out, content)
     return diagram
-
-
-def _net_of(path: str | Path) -> tuple[NetParameter, SourceMap]:
-    read: Any = parse_net_or_solver(path)
-    if isinstance(read[0], NetParameter):
-        return read
-    described = solver_nets(*read)
-    return described[0].net, described[0].source

@@ -79,10 +79,7 @@ def other_outputs(logs: Sequence[TrainingLog]) -> list[str]:
 
 
 def _draw_losses(axis: Axes, log: TrainingLog, number: int, apart: float) -> None:
-    color = COLORS[number % len(COLORS)]
-    x, y = log.loss.arrays()
-    _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
-    _line(axis, x, smoothed(y), f"run{number}-smooth", color=color, linewidth=1.6)
+    x, y = _draw_train(axis, log.loss, number)
     bad = x[~np.isfinite(y)]
     if len(bad):
         marks = axis.plot(bad, np.full(len(bad), 0.02), "x", color=FAULT, transform=axis.get_xaxis_transform())
@@ -95,13 +92,18 @@ def _draw_losses(axis: Axes, log: TrainingLog, number: int, apart: float) -> Non
 
 def _draw_output(axis: Axes, log: TrainingLog, name: str, number: int, apart: float) -> None:
     if name not in log.losses and name in log.train:
-        x, y = log.train[name].arrays()
-        color = COLORS[number % len(COLORS)]
-        _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
-        _line(axis, x, smoothed(y), f"run{number}-smooth", color=color, linewidth=1.6)
+        _draw_train(axis, log.train[name], number)
     for net, curves in log.tests.items():
         if name in curves and name not in log.losses:
             _draw_test(axis, curves[name], number, net, apart)
+
+
+def _draw_train(axis: Axes, curve: Curve, number: int) -> tuple[np.ndarray, np.ndarray]:
+    x, y = curve.arrays()
+    color = COLORS[number % len(COLORS)]
+    _line(axis, x, y, f"run{number}-raw", color=color, linewidth=0.8, alpha=0.3)
+    _line(axis, x, smoothed(y), f"run{number}-smooth", color=color, linewidth=1.6)
+    return x, y
 
 
 def _draw_test(axis: Axes, curve: Curve, number: int, net: int, apart: float) -> None:

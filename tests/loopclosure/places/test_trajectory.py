@@ -55,6 +55,16 @@ def test_missing_depth_images_are_a_warning(tmp_path: Path) -> None:
     assert sequence.doubts[-1].endswith(f'no such image "depth/a.png" in {tmp_path}; depth is not used')
 
 
+def test_depth_images_are_found_by_their_times_in_any_order(tmp_path: Path) -> None:
+    pictures(tmp_path, "a.png", "b.png", "c.png")
+    write(tmp_path / "rgb.txt", "1.0 rgb/a.png\n2.0 rgb/b.png\n3.0 rgb/c.png\n")
+    (tmp_path / "depth").mkdir()
+    for name in ("a.png", "c.png"):
+        (tmp_path / "depth" / name).touch()
+    write(tmp_path / "depth.txt", "3.01 depth/c.png\n0.98 depth/a.png\n")
+    assert read_sequence(tmp_path).depths == (tmp_path / "depth/a.png", None, tmp_path / "depth/c.png")
+
+
 def test_missing_empty_and_binary_files_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         read_sequence(tmp_path / "nowhere", "tum").with_poses()
