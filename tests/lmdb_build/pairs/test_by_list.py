@@ -76,18 +76,6 @@ class TestMask:
         assert label(source, "run/1.png", "run/3.png") == LEFT_OUT  # nearer than any marked pair of one camera
         assert len(source.positives()) == 5
 
-    def test_a_mask_of_places_works_for_images_of_one_camera(self, run: Path) -> None:
-        mask = np.zeros((6, 6), np.uint8)
-        mask[4, 1] = 255
-        cv2.imwrite(str(run / "six.png"), mask)
-        source = MaskSource(run / "six.png", run / "run", run, camera="right")
-        assert label(source, "run/10.png", "run/4.png") == POSITIVE
-
-    def test_a_mask_of_another_size_is_refused(self, run: Path) -> None:
-        images(run / "run", "13.png")
-        with pytest.raises(InputError, match=r"mask\.png: is 12 x 12, but there are 13 images"):
-            MaskSource(run / "mask.png", run / "run", run)
-
 
 class TestFolders:
     @pytest.fixture

@@ -118,17 +118,6 @@ def test_fabmap_stride_and_limit_count_places(fabmap_folder):
     assert data.truth.positives == 1
 
 
-def test_fabmap_mask_of_places_for_images_of_both_cameras(fabmap_folder):
-    truth = np.zeros((6, 6), np.uint8)
-    truth[5, 2] = 1
-    np.save(fabmap_folder / "six.npy", truth)
-    data = load_fabmap(
-        fabmap_folder, camera="right", exclusion=Exclusion(frames=1), truth_file=fabmap_folder / "six.npy"
-    )
-    assert data.truth.hard[5, 2]
-    assert data.queries.paths[5].stem == "0012"
-
-
 @pytest.mark.slow
 def test_fabmap_faults(fabmap_folder, tmp_path):
     with pytest.raises(InputError, match="unknown camera"):

@@ -10,8 +10,7 @@ def rows(text: str) -> np.ndarray:
     return np.array([[int(digit) for digit in row] for row in text.split()])
 
 
-# Both compared with a compiled openFABMAP.
-EXAMPLE_A = rows("11001 11000 11100 00110 00111 00100 10001 01010 00010 11001")
+# test_fabmap.py compares what follows from its tree with a compiled openFABMAP.
 EXAMPLE_B = rows(
     "111001 111111 100001 000110 101001 101000 111111 111111 000001 001001 111101 011000 011111 011001 011000 111001"
 )
@@ -22,32 +21,6 @@ def information(words: np.ndarray) -> np.ndarray:
     frequency = words.mean(axis=0)
     joint = words.T @ words / len(words)
     return np.stack([mutual_information(joint[q], frequency, 0.98 * frequency + 0.01, q) for q in range(len(joint))])
-
-
-def test_example_a_with_ties_resolved_by_order() -> None:
-    tree = learn_tree(EXAMPLE_A)
-    np.testing.assert_array_equal(tree.parent, [0, 0, 0, 0, 0])
-    np.testing.assert_allclose(tree.marginal, [0.5, 0.5, 0.402, 0.402, 0.402], atol=1e-12)
-    np.testing.assert_allclose(tree.given_present, [0.5, 0.794, 0.206, 0.01, 0.598], atol=1e-12)
-    np.testing.assert_allclose(tree.given_absent, [0.5, 0.206, 0.598, 0.794, 0.206], atol=1e-12)
-
-
-def test_example_b() -> None:
-    tree = learn_tree(EXAMPLE_B)
-    np.testing.assert_array_equal(tree.parent, [2, 3, 1, 3, 3, 0])
-    np.testing.assert_allclose(tree.marginal, [0.56125, 0.6225, 0.80625, 0.3775, 0.31625, 0.745], atol=1e-12)
-    np.testing.assert_allclose(
-        tree.given_present, [0.613076923, 0.826666667, 0.99, 0.3775, 0.826666667, 0.881111111], atol=1e-9
-    )
-    np.testing.assert_allclose(tree.given_absent, [0.336666667, 0.5, 0.5, 0.3775, 0.01, 0.57], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("one", "other", "nats"), [(3, 4, 0.452172), (1, 2, 0.222787), (0, 5, 0.067414), (1, 3, 0.059412), (0, 2, 0.024746)]
-)
-def test_information_of_example_b(one: int, other: int, nats: float) -> None:
-    assert information(EXAMPLE_B)[one, other] == pytest.approx(nats, abs=1e-6)
-    assert information(EXAMPLE_B)[other, one] == information(EXAMPLE_B)[one, other]
 
 
 def test_the_tree_has_maximal_information() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from loopclosure.errors import InputError
 from loopclosure.words.chow_liu import WordTree, learn_tree
-from loopclosure.words.fabmap import FabMapModel, FabMapSettings, log_odds, place_table
+from loopclosure.words.fabmap import FabMapModel, FabMapSettings, log_odds
 
 
 def rows(text: str) -> np.ndarray:
@@ -36,24 +36,6 @@ def synthetic_walk(images: int = 60, words: int = 80, seed: int = 0) -> tuple[Wo
     walk = np.concatenate([lap, again])
     walk[7] = False  # an image without a single feature
     return learn_tree(training), training, walk
-
-
-def test_table_of_example_b() -> None:
-    table = place_table(learn_tree(TRAIN_B), FabMapSettings()).reshape(6, 8)
-    np.testing.assert_allclose(
-        table[:2],
-        [
-            [0.911314161, 0.806296331, 0.088685839, 0.193703669, 0.797660032, 0.558058031, 0.202339968, 0.441941969],
-            [0.859894107, 0.674540418, 0.140105893, 0.325459582, 0.720609166, 0.350987868, 0.279390834, 0.649012132],
-        ],
-        atol=1e-9,
-    )
-
-
-@pytest.mark.parametrize("false_alarm", [0.0, 0.005])
-def test_tables_are_probabilities(false_alarm: float) -> None:
-    table = place_table(learn_tree(TRAIN_B), FabMapSettings(false_alarm=false_alarm))
-    np.testing.assert_allclose(table.sum(axis=2), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", json.loads(Path(__file__).with_name("openfabmap.json").read_text()))

@@ -5,11 +5,9 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-import netspec
 from contexts import context
 from netspec.errors import SpecError, Where
 from netspec.layers import Layer, layer_class
@@ -78,25 +76,6 @@ def test_python_layer_computes_tops_and_gradients_of_any_shape_and_dtype(python,
         assert bottom.grad is not None
         assert torch.equal(bottom.grad, 10 * diff)
     assert layer.top_shapes == [(4, 5, 1)]
-
-
-def test_net_of_python_layers_computes_tops_and_gradients(python, tmp_path: Path) -> None:
-    layers = [
-        f"layer {{ type: 'Python' name: '{name}' bottom: '{bottom}' top: '{name}' "
-        "python_param { module: 'layers_of_mine' layer: 'TimesTen' } }"
-        for name, bottom in (("one", "data"), ("two", "one"), ("three", "two"))
-    ]
-    path = tmp_path / "net.prototxt"
-    path.write_text("input: 'data' input_shape { dim: 10 dim: 9 dim: 8 } force_backward: true\n" + "\n".join(layers))
-    with pytest.raises(SpecError, match=r"net.prototxt:2:9: layer \"one\" \(Python\): a Python layer runs code"):
-        netspec.load_net(path)
-    net = netspec.load_net(path, allow_python=True)
-    data = torch.full((10, 9, 8), 8.0, requires_grad=True)
-    top = net(data=data)["three"]
-    assert (top == 8000).all()
-    top.backward(torch.full((10, 9, 8), 7.0))
-    assert (data.grad == 7000).all()
-    assert net(data=np.ones((4, 4, 4, 4), np.float32))["three"].shape == (4, 4, 4, 4)
 
 
 def test_backward_is_told_which_bottoms_need_a_gradient(python) -> None:
