@@ -138,8 +138,3 @@ def test_without_loops_metrics_are_nan():
     assert np.isnan(found.best_f1)
     assert np.isnan(found.recall_at_full_precision)
     assert curve(np.zeros(0), np.zeros(0, bool)).samples == 0
-
-
-def test_sizes_must_agree():
-    with pytest.raises(InputError, match=r"the scores are 5 x 4, the truth is 4 x 5"):
-        JudgedScores(SCORES.T, example_truth()).all_pairs_curve()

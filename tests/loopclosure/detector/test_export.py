@@ -33,12 +33,6 @@ def loop(query, match, inliers=None):
     return LoopResult(query, [(match, -0.25)], match, "accepted", -0.25, inliers, None)
 
 
-def test_relative_pose_is_the_inverse_times_the_other(poses):
-    for a in poses:
-        for b in poses:
-            np.testing.assert_allclose(matrix(relative_pose(a, b)), np.linalg.inv(matrix(a)) @ matrix(b), atol=1e-12)
-
-
 def test_g2o_edges_chain_the_vertices(tmp_path, poses):
     path = tmp_path / "out" / "graph.g2o"
     left_out = write_g2o(

@@ -60,13 +60,6 @@ def test_check_can_show_caffes_log(run: Run) -> None:
     assert loud.out == quiet.out
 
 
-def test_check_opens_no_data(run: Run) -> None:
-    Path("pairs").unlink()
-    assert run("check", NET, *PAIR_SHAPE).status == 0
-    wanted = f'{NET}:14:3: layer "pair_data" (Data): the shape of "pair_data" is known only from its data; '
-    assert run("check", NET).fault == wanted + "give --shape pair_data=50,C,H,W, or --data"
-
-
 def test_check_accepts_shapes_for_data_layers_and_inputs_only(run: Run) -> None:
     expected = f'{NET}: --shape: no data layer has a top "pair"; did you mean "pair_data"? their tops: pair_data, sim'
     assert run("check", NET, *PAIR_SHAPE, "--shape", "pair=1,2,28,28").fault == expected

@@ -111,15 +111,6 @@ def test_dropout_of_a_net_in_phase_train_drops_and_scales(net_of: Callable[..., 
     assert torch.equal(source_module(net)(torch.ones(4, 200)), torch.ones(4, 200))
 
 
-def test_names_that_are_invalid_in_python_compute_the_same(net_of: Callable[..., Net]) -> None:
-    text = """name: "1x1 net" layer { name: "in" type: "Input" top: "in" input_param { shape { dim: 2 dim: 3 } } }
-    layer { name: "class" type: "InnerProduct" bottom: "in" top: "self" inner_product_param { num_output: 2 } }
-    layer { name: "forward" type: "InnerProduct" bottom: "self" top: "print" inner_product_param { num_output: 2 } }
-    layer { name: "1/x" type: "InnerProduct" bottom: "in" top: "2/x" inner_product_param { num_output: 2 } }"""
-    net = trained(net_of(text))
-    assert_same(run_module(source_module(net), net, random_inputs(net)), here(net, random_inputs(net)))
-
-
 def test_torch_export_archives_the_source_for_other_batches_and_sizes(
     net_of: Callable[..., Net], tmp_path: Path
 ) -> None:

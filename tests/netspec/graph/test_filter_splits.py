@@ -95,14 +95,3 @@ def test_a_loss_weight_counts_as_a_use_and_moves_to_the_first_copy() -> None:
     assert list(split.layer[1].loss_weight) == []
     assert list(split.layer[2].loss_weight) == [0.5, 0.0]
     assert split.layer[3].bottom[0] == "s_sum_0_split_1"
-
-
-def test_an_unknown_bottom_is_reported_with_place_and_suggestion() -> None:
-    text = (
-        'layer { name: "data" type: "Input" top: "pool1" }\nlayer { name: "c" type: "ReLU"\n  bottom: "pol1" top: "c" }'
-    )
-    net, source = parse_net_text(text, "net.prototxt")
-    with pytest.raises(SpecError) as caught:
-        insert_splits(net, source)
-    expected = 'net.prototxt:3:3: layer "c" (ReLU): unknown bottom blob "pol1"; did you mean "pool1"? available: pool1'
-    assert str(caught.value) == expected
