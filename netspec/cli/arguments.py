@@ -113,6 +113,20 @@ SHARED: dict[str, dict[str, dict[str, Any]]] = {  # by group: the settings of ea
     },
     "blob": {"--blob": {"action": "extend", "nargs": "+", "default": [], "metavar": "BLOB"}},
     "shape": {"--shape": {"action": "append", "type": blob_shape, "default": [], "metavar": "BLOB=N,C,H,W"}},
+    "pixels": {  # in this order
+        "--swap": {"action": "store_true", "help": "reverse the channels: from BGR to RGB, or back"},
+        "--raw-scale": {
+            "type": float,
+            "default": 1.0,
+            "metavar": "S",
+            "help": "then multiply the pixels (0 to 255) by this",
+        },
+        "--mean": {
+            "metavar": "A,B,C|FILE",
+            "help": "then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
+        },
+        "--scale": {"type": float, "default": 1.0, "metavar": "S", "help": "then multiply by this"},
+    },
     "data": {"--data": {"action": "store_true", "help": "open databases, lists and mean files"}},
     "strict": {"--strict": {"action": "store_true", "help": "refuse weights that lack a layer of the net"}},
     "python": {
@@ -158,7 +172,7 @@ SHARED: dict[str, dict[str, dict[str, Any]]] = {  # by group: the settings of ea
 }
 
 
-def add(parser: argparse.ArgumentParser, *groups: str, **changed: Any) -> None:
+def add(parser: argparse._ActionsContainer, *groups: str, **changed: Any) -> None:
     """Add groups of :data:`SHARED`; ``changed`` are other settings of their options."""
     for group in groups:
         for names, settings in SHARED[group].items():

@@ -63,36 +63,24 @@ def _add_extract(commands: Commands) -> None:
         help="let data layer LAYER read this database instead of its own",
     )
     parser.add_argument("--iterations", type=positive, metavar="N", help="batches to run (default: every record once)")
-    parser.add_argument("--images", metavar="FOLDER|LIST", help="use image files instead of records")
-    parser.add_argument(
+    add(parser, "gpu", "phase", "state", "python", "exact", "passes", "strict", "engine")
+    group = parser.add_argument_group(
+        "image files", "With any of the last four options, the data layer's transform_param is not used."
+    )
+    group.add_argument("--images", metavar="FOLDER|LIST", help="use image files instead of records")
+    group.add_argument(
         "--input", default="data", metavar="BLOB", help="the blob that images go into (default: %(default)s)"
     )
-    parser.add_argument(
+    group.add_argument(
         "--zooms",
         type=_zooms,
         metavar="1,0.7",
         help="describe several views of each image, e.g. the whole (1) and its center (0.7)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
     )
-    parser.add_argument("--swap", action="store_true", help="for image files: reverse the channels, from BGR to RGB")
-    parser.add_argument(
-        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply the pixels (0 to 255) by this"
-    )
-    parser.add_argument(
-        "--mean",
-        metavar="A,B,C|FILE",
-        help="then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
-    )
-    parser.add_argument(
-        "--scale",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="then multiply by this; with any of these four options, the data layer's transform_param is not used",
-    )
-    add(parser, "gpu", "phase", "state", "python", "exact", "passes", "strict", "engine")
+    add(group, "pixels")
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -222,19 +210,13 @@ def _add_export(commands: Commands) -> None:
     parser.add_argument(
         "--no-labels", action="store_true", help="leave out labels, and the losses and accuracies that need them"
     )
-    parser.add_argument(
-        "--input", default="data", metavar="BLOB", help="the input for the options below (default: %(default)s)"
+    group = parser.add_argument_group("ONNX", "What the model does to its images.")
+    group.add_argument(
+        "--input", default="data", metavar="BLOB", help="the input that is images (default: %(default)s)"
     )
-    parser.add_argument("--crop", action="store_true", help="ONNX: crop larger images to their center")
-    parser.add_argument(
-        "--swap", action="store_true", help="ONNX: the channels of the images are reversed (RGB for BGR)"
-    )
-    parser.add_argument("--raw-scale", type=float, default=1.0, metavar="S", help="ONNX: first multiply images by this")
-    parser.add_argument(
-        "--mean", metavar="A,B,C|FILE", help="ONNX: then subtract this: numbers, or a .binaryproto or .npy file"
-    )
-    parser.add_argument("--scale", type=float, default=1.0, metavar="S", help="ONNX: then multiply by this")
-    parser.add_argument("--uint8", action="store_true", help="ONNX: images are uint8")
+    group.add_argument("--uint8", action="store_true", help="they are uint8")
+    group.add_argument("--crop", action="store_true", help="crop larger images to their center")
+    add(group, "pixels")
 
 
 def _export(arguments: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 import sys
 import sysconfig
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -55,15 +56,7 @@ def install_caffe() -> list[Path]:
     paths = {_package(): _PACKAGE} | {_script(name): _command(*command) for name, command in _COMMANDS.items()}
     found = PathFinder.find_spec(NAME)
     imported = [Path(found.origin)] if found is not None and found.origin else []  # a mere folder has no origin
-    there = [str(path) for path in dict.fromkeys([*imported, *paths]) if path.exists() and not _is_ours(path)]
-    if there:
-        raise SpecError(f"{', '.join(there)}: already exists and is not netspec's; remove it first")
-    for path, text in paths.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, text)
-        if path != _package():
-            path.chmod(0o755)
-    return list(paths)
+    return _write(paths, "remove it first", imported)
 
 
 def remove_caffe() -> list[Path]:
@@ -82,15 +75,8 @@ def make_build_folder(folder: Path) -> list[Path]:
 
     Raises SpecError if there is another file at one of these paths, and OSError if the folder cannot be written to.
     """
-    paths = _build_paths(folder)
-    there = [str(path) for path in paths if path.exists() and not _is_ours(path)]
-    if there:
-        raise SpecError(f"{', '.join(there)}: already exists and is not netspec's; choose another folder")
-    for path, (module, words) in paths.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, _command(module, words))
-        path.chmod(0o755)
-    return list(paths)
+    paths = {path: _command(*command) for path, command in _build_paths(folder).items()}
+    return _write(paths, "choose another folder")
 
 
 def remove_build_folder(folder: Path) -> list[Path]:
@@ -103,6 +89,19 @@ def remove_build_folder(folder: Path) -> list[Path]:
         with suppress(OSError):  # it is not empty
             parent.rmdir()
     return removed
+
+
+def _write(texts: Mapping[Path, str], advice: str, others: Sequence[Path] = ()) -> list[Path]:
+    """Write the files if neither they nor ``others`` are there yet, unless they are ours; return their paths."""
+    there = [str(path) for path in dict.fromkeys([*others, *texts]) if path.exists() and not _is_ours(path)]
+    if there:
+        raise SpecError(f"{', '.join(there)}: already exists and is not netspec's; {advice}")
+    for path, text in texts.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text)
+        if text.startswith("#!"):
+            path.chmod(0o755)
+    return list(texts)
 
 
 def _build_paths(folder: Path) -> dict[Path, tuple[str, list[str]]]:

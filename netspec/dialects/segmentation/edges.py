@@ -18,6 +18,7 @@ from netspec.dialects.segmentation.pairs import Array, pair_source
 from netspec.layers.contract.base import Shape
 from netspec.layers.data.files import ImageData
 from netspec.layers.loss.losses import SigmoidCrossEntropyLoss
+from netspec.proto.schema import copy_without
 
 
 class EdgeMaps(ImageData):
@@ -32,10 +33,7 @@ class EdgeMaps(ImageData):
 
     def open(self) -> Source | None:
         draws = self.draws
-        bare = type(self.param.transform_param)()
-        bare.CopyFrom(self.param.transform_param)
-        for name in ("mean_file", "mean_value", "scale"):
-            bare.ClearField(name)
+        bare = copy_without(self.param.transform_param, ("mean_file", "mean_value", "scale"))
         as_images = Transformer(bare, self.phase, self.context.at, draws.seed, draws.stream)  # the same random numbers
 
         def cut(image: Array, labels: Array, position: int) -> tuple[Array, Array]:

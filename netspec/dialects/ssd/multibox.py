@@ -51,14 +51,6 @@ class Truth:
     labels: Array
 
 
-def read_truth(rows: Array, images: int, use_difficult: bool) -> list[Truth]:
-    """Return the true boxes by image, from rows (image, label, instance, xmin, ymin, xmax, ymax, difficult)."""
-    rows = rows if use_difficult else rows[rows[:, 7] == 0]
-    number = rows[:, 0].astype(int)  # -1: a placeholder row
-    found = [rows[number == i] for i in range(images)]
-    return [Truth(of_image[:, 3:7], of_image[:, 1].astype(int)) for of_image in found]
-
-
 def find_matches(
     param: Any, truth: list[Truth], priors: Array, kinds: int, decoded: Callable[[int, int], Array]
 ) -> tuple[Array, Array]:
@@ -211,8 +203,12 @@ class MultiBoxLoss(Layer):
         return None if self.settings.encode_variance_in_target else variances
 
     def _read_truth(self, rows: Array, images: int) -> list[Truth]:
-        p = self.settings
-        truth = read_truth(rows.reshape(-1, 8), images, p.use_difficult_gt)
+        """Return the true boxes of each image, from rows of 8 as in the docstring of the class."""
+        p, rows = self.settings, rows.reshape(-1, 8)
+        rows = rows if p.use_difficult_gt else rows[rows[:, 7] == 0]
+        number = rows[:, 0].astype(int)  # -1: a placeholder row
+        found = [rows[number == i] for i in range(images)]
+        truth = [Truth(of_image[:, 3:7], of_image[:, 1].astype(int)) for of_image in found]
         classes = math.inf if p.map_object_to_agnostic else p.num_classes
         for true in truth:
             wrong = (true.labels == p.background_label_id) | (true.labels < 0) | (true.labels >= classes)

@@ -21,7 +21,7 @@ from netspec.graph.options import BuildOptions
 from netspec.graph.plan import Node, Plan, make_plan
 from netspec.layers import Layer, layer_class
 from netspec.net.build import build_filtered
-from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue, given
+from netspec.proto.schema import PHASE_NAMES, NetParameter, PhaseValue, copy_without, given
 from netspec.proto.source_map import Position, SourceMap
 from netspec.proto.text import write_text
 from netspec.proto.writer import scalar_text
@@ -289,10 +289,7 @@ def _text(layer: Any) -> str:
 
 def _without_names(layer: Any) -> str:
     """Return a layer's prototxt without the names of the layer, its blobs and its parameters."""
-    bare = type(layer)()
-    bare.CopyFrom(layer)
-    for name in ("name", "bottom", "top", "blobs"):
-        bare.ClearField(name)
+    bare = copy_without(layer, ("name", "bottom", "top", "blobs"))
     for param in bare.param:
         param.name = "shared" if param.name else ""
     return write_text(bare)

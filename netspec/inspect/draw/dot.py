@@ -41,7 +41,9 @@ def dot_of(diagram: Diagram, unfolded: bool = False) -> str:
     most = max((box.work for box in diagram.boxes), default=0)
     nodes = _nodes(diagram)
     blocks = find_blocks(diagram)
-    hidden = {} if unfolded else {k: _first_copy(block, k) for block in blocks for k in block.boxes}
+    # The box of the first copy stands for those of the others.
+    copies = {k: block.first + (k - block.first) % block.length for block in blocks for k in block.boxes}
+    hidden = {} if unfolded else copies
     lines = [
         "digraph {",
         'graph [rankdir="TB" nodesep="0.35" ranksep="0.3" fontname="Arial" bgcolor="white" labelloc="t" labeljust="l"]',
@@ -69,11 +71,6 @@ def _nodes(diagram: Diagram) -> list[str]:
             name = f"{printable(box.name)} ({count})"
         names[name] = None
     return ['"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"' for name in names]
-
-
-def _first_copy(block: Block, k: int) -> int:
-    """Return the box of the first copy that stands for box ``k`` of a block."""
-    return block.first + (k - block.first) % block.length
 
 
 def _clusters(diagram: Diagram, nodes: Sequence[str], blocks: Iterable[Block], unfolded: bool) -> Iterator[str]:

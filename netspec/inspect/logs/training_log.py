@@ -141,10 +141,6 @@ class TrainingLog:
         curves = (self.loss, self.rate, *(curve for net in self.tests.values() for curve in net.values()))
         return max((curve.iterations[-1] for curve in curves if len(curve)), default=0)
 
-    def test_label(self, net: int) -> str:
-        """Return the name of a test net: "test" if it is the only one."""
-        return "test" if len(self.tests) == 1 else f"test net {net}"
-
     def curves(self) -> list[Curve]:
         """Return all curves."""
         tests = [curve for net in self.tests.values() for curve in net.values()]
@@ -267,7 +263,7 @@ def summary(log: TrainingLog) -> dict[str, str]:
     if log.loss.last is not None:
         found["last loss"] = number(log.loss.last)
     for net, curves in log.tests.items():
-        label = log.test_label(net)
+        label = "test" if len(log.tests) == 1 else f"test net {net}"
         for name, curve in list(curves.items())[:_MOST_OUTPUTS]:
             found[f"{label} {name}"] = number(curve.values[-1])
             finite = [value for value in curve.values if math.isfinite(value)]
