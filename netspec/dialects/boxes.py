@@ -39,7 +39,7 @@ def check_predictions(layer: Layer, bottom_shapes: Sequence[Shape], kinds: int, 
     priors = math.prod(prior) // 8
     for i, (shape, each, what) in enumerate(((loc, 4 * kinds, "numbers of boxes"), (conf, classes, "confidences"))):
         if math.prod(shape[1:]) != priors * each or shape[:1] != loc[:1]:
-            message = f"found {what} of shape {shape}, expected ({loc[0]}, {priors * each}) for {priors} priors"
+            message = f"found {what} of shape {shape}, expected (N, {priors * each}) for {priors} priors"
             raise layer.error(message, "bottom", i)
     return priors
 

@@ -99,6 +99,7 @@ class Dialects(Forks):
         if owner:
             from netspec.dialects.layers import CLASSES
 
+            cls.takes_empty = False
             CLASSES.setdefault(cls.type, {})[owner] = cls
         return bool(owner)
 

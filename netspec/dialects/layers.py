@@ -40,7 +40,7 @@ def replace(type_name: str, *reads: str, where: Condition = lambda param: True) 
 
     def add(cls: L) -> L:
         cls.type = type_name
-        cls.reads = frozenset(reads)
+        cls.reads, cls.takes_empty = frozenset(reads), False
         _replacing.setdefault(type_name, {})[owner] = cls, where
         return cls
 

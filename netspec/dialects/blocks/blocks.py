@@ -276,8 +276,8 @@ class DeephiResize(Layer):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         p, (shape,) = self.settings, bottom_shapes
         size = p.new_height, p.new_width
-        if not p.new_height:
-            size = int(shape[-2] * p.scale_h), int(shape[-1] * p.scale_w)
+        if not p.new_height and len(shape) == 4:
+            size = int(shape[2] * p.scale_h), int(shape[3] * p.scale_w)
         if len(shape) != 4 or min(size) < 1:
             raise self.error(
                 f"found a bottom of shape {shape} for a top of {size[0]} x {size[1]}, expected maps", "bottom"

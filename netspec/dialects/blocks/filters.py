@@ -149,7 +149,7 @@ class Pooling(pooling.Pooling):
     def reshape(self, bottom_shapes: Sequence[Shape]) -> Sequence[Shape]:
         """Return the shape of the top; the pad of each side must be less than the kernel."""
         shape, param = bottom_shapes[0], self.param.pooling_param
-        if len(shape) != 4 or min(shape) < 1:
+        if len(shape) != 4:
             raise self.error(f"pooling needs a bottom of 4 axes (N, C, H, W), found shape {shape}", "bottom")
         self.kernel = (shape[2], shape[3]) if param.global_pooling else self.kernel
         counts, self.frame, self.lengths = [], [], []

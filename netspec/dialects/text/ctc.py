@@ -22,7 +22,7 @@ LOSS, DECODER = "ctc_loss_param", "ctc_decoder_param"
 
 def check_scores(layer: Layer, scores: Shape) -> None:
     """Raise SpecError for scores that are not (T, N, C)."""
-    if len(scores) < 3 or any(size != 1 for size in scores[3:]):
+    if len(scores) < 3 or not scores[0] or any(size != 1 for size in scores[3:]):
         raise layer.error(f"found scores of shape {scores}, expected (T, N, C)", "bottom", 0)
 
 

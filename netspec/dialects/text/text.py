@@ -173,7 +173,7 @@ class Lstm(Layer):
         """Add the blobs; the initial state is 0."""
         param, shape = value(self.param, "lstm_param"), self.bottom_shapes[0]
         check_at_least_1(self, "lstm_param", "num_output")
-        if len(shape) not in (2, 3):
+        if len(shape) not in (2, 3) or not shape[0]:
             raise self.error(f"found a bottom of shape {shape}, expected (T, N, C) or (T N, C)", "bottom", 0)
         self.size, self.clip, self.items = param.num_output, param.clipping_threshold, param.batch_size
         for sizes, name in (((shape[-1],), "weight_filler"), ((self.size,), "weight_filler"), ((), "bias_filler")):

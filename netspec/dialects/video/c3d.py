@@ -164,7 +164,7 @@ class _VolumePooling(Layer):
         for size, length, stride, pad in axes:
             count = -(-(size + 2 * pad - length) // stride) + 1
             count -= self.drops_last and pad > 0 and (count - 1) * stride >= size + pad
-            if min(count, *shape) < 1 or (count - 1) * stride - pad >= size or length <= pad:
+            if count < 1 or (count - 1) * stride - pad >= size or length <= pad:
                 raise self.error(f"no window of {kernel} fits a map of {shape[2:]}, or one lies outside", self.group)
             self.frame = [pad, (count - 1) * stride + length - pad - size, *self.frame]
             starts = torch.arange(count, dtype=torch.float64) * stride - pad

@@ -93,7 +93,7 @@ class _OfMaps(Layer):
         """Raise SpecError for bottoms without four axes, or that differ in the axes ``same``."""
         first = bottom_shapes[0]
         for i, shape in enumerate(bottom_shapes):
-            if len(shape) != 4 or min(shape) < 1 or shape[self.same] != first[self.same]:
+            if len(shape) != 4 or shape[self.same] != first[self.same]:
                 raise self.error(f"found a bottom of shape {shape}, the first has {first}, expected maps", "bottom", i)
 
 

@@ -43,7 +43,7 @@ class _DarknetLoss(Loss):
         """Return the shape of the scalar top; the map must have the channels of its boxes."""
         maps, truth = bottom_shapes
         channels = self.settings.num * (CLASSES + self.settings.num_class)
-        if len(maps) != 4 or maps[1] != channels:
+        if len(maps) != 4 or maps[1] != channels or not maps[0]:
             raise self.error(f"found a map of shape {maps}, expected (N, {channels}, S, S)", "bottom", 0)
         if truth[:1] != maps[:1] or truth[-1:] != (5,):
             raise self.error(f"found true boxes of shape {truth}, expected ({maps[0]}, 1, n, 5)", "bottom", 1)
@@ -53,6 +53,11 @@ class _DarknetLoss(Loss):
         items, height, width = (maps.shape[i] for i in (0, 2, 3))
         cells = as_array(maps).reshape(items, self.settings.num, -1, height, width)
         boxes = as_array(truth).reshape(items, -1, 5)
+        first = np.concatenate([each[: _until(each[:, 3]), :3] for each in boxes])
+        if len(wrong := first[~((first >= 0) & (first < (self.settings.num_class, 1, 1))).all(axis=1)]):
+            found = "found a true box of class {:g} at {:g}, {:g}".format(*wrong[0])
+            fault = f"{found}; expected a class below {self.settings.num_class} and a center from 0 to below 1"
+            raise self.error(fault, "bottom", 1)
         moves = np.stack([self._moves(*each) for each in zip(cells, boxes, strict=True)])
         diff = self._gradient(moves, cells)
         moves, diff = (torch.from_numpy(each.reshape(maps.shape)).to(maps) for each in (moves, diff))

@@ -108,12 +108,9 @@ class _YoloOutput(Layer):
         p = value(self.param, self.group)
         channels = p.num_box * (CLASSES + p.num_classes)
         for i, shape in enumerate(bottom_shapes):
-            if len(shape) != 4 or shape[1] != channels or shape[0] != bottom_shapes[0][0]:
-                sizes = f"{p.num_box} boxes of {CLASSES} + {p.num_classes} channels"
-                message = (
-                    f"found a bottom of shape {shape}, expected ({bottom_shapes[0][0]}, {channels}, H, W): {sizes}"
-                )
-                raise self.error(message, "bottom", i)
+            if len(shape) != 4 or shape[1] != channels or shape[0] != bottom_shapes[0][0] or not shape[0]:
+                sizes = f"(N, {channels}, H, W): {p.num_box} boxes of {CLASSES} + {p.num_classes} channels"
+                raise self.error(f"found a bottom of shape {shape}, expected {sizes}", "bottom", i)
         return [(1, 1, 1, 7)]
 
     def forward(self, *bottoms: torch.Tensor) -> torch.Tensor:

@@ -78,6 +78,7 @@ class Layer(torch.nn.Module):
     same_tops: ClassVar[bool] = False  # as many tops as bottoms
     is_loss: ClassVar[bool] = False  # a missing top is added, and default_loss_weight is 1
     is_input: ClassVar[bool] = False  # its tops are given by the caller
+    takes_empty: ClassVar[bool] = True  # bottoms of no channels or pixels; layers of forks take only those of no items
     label_bottoms: ClassVar[frozenset[int]] = frozenset()  # never receive a gradient (Caffe's AllowForceBackward)
     reads: ClassVar[frozenset[str]] = frozenset()  # the fields of LayerParameter that it reads; set by ``register``
     ignores: frozenset[str] = frozenset()  # those of ``reads`` that have no effect, e.g. "data_param.scale"
@@ -357,6 +358,9 @@ class Layer(torch.nn.Module):
 
     def _reshaped(self, bottom_shapes: list[Shape]) -> list[Shape]:
         """Return the result of ``reshape``, after checking that it has a possible shape for each top."""
+        empty = [i for i, shape in enumerate(bottom_shapes) if 0 in shape[1:]]
+        if empty and not self.takes_empty:
+            raise self.error(f"found an empty bottom, of shape {bottom_shapes[empty[0]]}", "bottom", empty[0])
         shapes: Any = self.reshape(bottom_shapes)
         if not isinstance(shapes, Sequence) or not all(isinstance(shape, Sequence) for shape in shapes):
             raise self.error(f"reshape returned {shapes!r}, expected one shape for each top, such as [(2, 3)]", "type")

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 import torch
 
 from fresh_dialects import used_by
+from netspec.errors import SpecError
 from netspec.layers import Layer
 
 Build = Callable[..., Layer]
@@ -31,3 +33,11 @@ def test_output_without_detections_is_a_row_of_minus_one_per_image(build: Build)
 
 def test_the_layer_type_activates_the_dialect() -> None:
     assert used_by(f"layer {{ {V3 % 1} }}") == ["yolo"]
+
+
+@pytest.mark.parametrize("box", [[2, 0.5, 0.5], [-1, 0.5, 0.5], [0, 1.0, 0.5], [0, 0.5, -0.1]], ids=str)
+def test_true_boxes_outside_of_the_classes_or_the_map_are_refused(box: list[float], build: Build) -> None:
+    settings = "region_loss_param { num_class: 2 num: 2 biases: [0.5, 1, 2, 1.5] }"
+    layer = build("yolo", f"type: 'RegionLoss' {settings}", (1, 14, 3, 3), (1, 1, 1, 5))
+    with pytest.raises(SpecError, match=r"expected a class below 2 and a center from 0 to below 1"):
+        layer.run(torch.zeros(1, 14, 3, 3), torch.tensor([[[[*box, 0.2, 0.3]]]]))
