@@ -68,26 +68,21 @@ def to_array(proto: Any) -> np.ndarray:
 def from_array(values: np.ndarray, diff: np.ndarray | None = None) -> Any:
     """Return a BlobProto with the values and their gradient: float32 as in Caffe, or doubles for float64."""
     wide = values.dtype == np.float64
-    runs = _Runs()
-    for array, names in ((values, _DATA), (diff, _DIFF)):
-        if array is not None:
-            setattr(runs, names[wide], np.ascontiguousarray(array, "<f8" if wide else "<f4").tobytes())
-    proto = _of_shape(values.shape)
-    proto.MergeFromString(runs.SerializeToString())
-    return proto
+    given = {names[wide]: array for array, names in ((values, _DATA), (diff, _DIFF)) if array is not None}
+    dtype = "<f8" if wide else "<f4"
+    return _blob(values.shape, **{name: np.ascontiguousarray(each, dtype).tobytes() for name, each in given.items()})
 
 
 def in_half_precision(values: np.ndarray) -> Any:
     """Return a BlobProto with the values in half precision as raw_data, as NVIDIA Caffe and OpenCV write it."""
-    runs = _Runs(raw_data_type=_RAW_DTYPES.index("<f2"), raw_data=values.astype("<f2").tobytes())
-    proto = _of_shape(values.shape)
-    proto.MergeFromString(runs.SerializeToString())
+    return _blob(values.shape, raw_data_type=_RAW_DTYPES.index("<f2"), raw_data=values.astype("<f2").tobytes())
+
+
+def _blob(shape: Shape, **runs: Any) -> Any:
+    """Return a BlobProto with these fields of _Runs. As in Caffe, ``shape`` is absent if there are no axes."""
+    proto = BlobProto(shape=BlobShape(dim=shape)) if shape else BlobProto()
+    proto.MergeFromString(_Runs(**runs).SerializeToString())
     return proto
-
-
-def _of_shape(shape: Shape) -> Any:
-    """Return a BlobProto with a shape. As in Caffe, the field ``shape`` is absent if there are no axes."""
-    return BlobProto(shape=BlobShape(dim=shape)) if shape else BlobProto()
 
 
 def _check_count(found: int, name: str, shape: Shape) -> None:

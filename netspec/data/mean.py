@@ -6,7 +6,7 @@ Caffe: src/caffe/data_transformer.cpp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from tokenize import TokenError
+from pathlib import Path
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -14,6 +14,7 @@ from google.protobuf.message import DecodeError
 from netspec import log
 from netspec.data import blobs
 from netspec.errors import SpecError, Where
+from netspec.files.arrays import opened, read_array
 from netspec.files.kinds import pointer_fault, unreadable
 from netspec.files.limits import read_bytes
 from netspec.proto.schema import BlobProto
@@ -70,10 +71,8 @@ def read_mean_option(text: str) -> np.ndarray:
         pass
     if not text.endswith(".npy"):
         return read_mean(text, Where("--mean"))
-    try:
-        mapped = np.load(text, mmap_mode="r", allow_pickle=False)  # the file size limits the size of the array
-        if not np.all(np.isfinite(mapped)):
+    with opened(Path(text), "an array of a mean") as stream:
+        mean = read_array(stream)
+        if not np.all(np.isfinite(mean)):
             raise ValueError("it contains a NaN or an infinity")
-        return np.array(mapped, np.float32)
-    except (OSError, ValueError, TypeError, EOFError, SyntaxError, OverflowError, TokenError) as fault:
-        raise SpecError(f"cannot be read as an array: {' '.join(str(fault).split())}", Where(text)) from None
+        return np.array(mean, np.float32)

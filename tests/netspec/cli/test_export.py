@@ -146,7 +146,7 @@ def test_preprocessing_is_exported(onnx: Any, net: Net, run: Run) -> None:
         ("no/net.onnx: cannot be written: No such file or directory", "--to onnx --out no/net.onnx"),
         ("--out net.txt: expected a name that ends in .py", "--to torch --out net.txt"),
         ('no data layer has a top "dat"; did you mean "data"?', "--to onnx --out n.onnx --shape dat=1,3,8,8"),
-        ("no.npy: cannot be read as an array", "--to onnx --out n.onnx --mean no.npy"),
+        ("no.npy: no such file; expected an array of a mean", "--to onnx --out n.onnx --mean no.npy"),
         ('no input "x" in this net; it has: data', "--to onnx --out n.onnx --swap --input x"),
     ],
 )
