@@ -37,24 +37,12 @@ from netspec.terminal.parser import Commands
 
 def add_commands(commands: Commands) -> None:
     """Add the commands of this module."""
-    _add_image_list(
-        commands.add_parser(
-            "convert",
-            _convert_pairs,
-            help="write the pairs of a list into a database (convert_pairs_lmdb)",
-            epilog=OF_PAIRS,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-    )
-    _add_image_list(
-        commands.add_parser(
-            "imageset",
-            _convert_images,
-            help="write the images of a list into a database (convert_imageset)",
-            epilog=OF_IMAGES,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-    )
+    for name, function, what, epilog in (
+        ("convert", _convert_pairs, "write the pairs of a list into a database (convert_pairs_lmdb)", OF_PAIRS),
+        ("imageset", _convert_images, "write the images of a list into a database (convert_imageset)", OF_IMAGES),
+    ):
+        form = argparse.RawDescriptionHelpFormatter
+        _add_image_list(commands.add_parser(name, function, help=what, epilog=epilog, formatter_class=form))
     _add_mean(commands)
     _add_mnist(commands)
     _add_cifar(commands)
@@ -74,20 +62,14 @@ def _add_image_list(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, default=1, metavar="N", help="seed of the random order (default: %(default)s)"
     )
     _add_backend(parser)
-    parser.add_argument(
-        "--resize_width",
-        type=int,
-        default=0,
-        metavar="N",
-        help="resize images to this width; 0: do not resize (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--resize_height",
-        type=int,
-        default=0,
-        metavar="N",
-        help="resize images to this height; 0: do not resize (default: %(default)s)",
-    )
+    for side in ("width", "height"):
+        parser.add_argument(
+            f"--resize_{side}",
+            type=int,
+            default=0,
+            metavar="N",
+            help=f"resize images to this {side}; 0: do not resize (default: %(default)s)",
+        )
     parser.add_argument("--check_size", action="store_true", help="refuse images of different sizes")
     parser.add_argument("--encoded", action="store_true", help="store encoded images")
     parser.add_argument(
