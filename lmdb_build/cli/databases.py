@@ -62,9 +62,9 @@ def _add_image_list(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, default=1, metavar="N", help="seed of the random order (default: %(default)s)"
     )
     _add_backend(parser)
-    for side in ("width", "height"):
+    for option, side in (("--resize_width", "width"), ("--resize_height", "height")):
         parser.add_argument(
-            f"--resize_{side}",
+            option,
             type=int,
             default=0,
             metavar="N",
