@@ -16,9 +16,10 @@ from netspec.run.recorded import Kernels
 
 def _learn_scale(layer: Scale, how: Learning) -> Kernels | None:
     shape = layer.bottom_shapes[0]
+    if not layer.by_channel or math.prod(shape) == 0:
+        return None
     # Otherwise autograd computes the gradient of each layer from zero, before it adds those of layers that share blobs.
-    adds_at_once = layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place
-    if not layer.by_channel or math.prod(shape) == 0 or not adds_at_once:
+    if not (layer.arithmetic(layer.blob(0)).is_caffes and layer.context.options.accumulate_in_place):
         return None
     seen = (*shape[:2], math.prod(shape[2:]))
     return operation_kernels(ChannelProducts(), layer, (seen, seen), how)

@@ -48,7 +48,12 @@ LAYERS = {  # type: cases of parameters and shapes of the bottoms
     "Flatten": [("", [MAPS])],
     "Concat": [("", [MAPS, MAPS])],
     "Split": [("top: 'a' top: 'b'", [MAPS]), ("top: 'a' top: 'b' top: 'c'", [MAPS])],
-    "Scale": [("scale_param { bias_term: true }", [MAPS]), ("", [(6, 5)]), ("scale_param { axis: 0 }", [(6, 5)])],
+    "Scale": [
+        ("scale_param { bias_term: true }", [MAPS]),
+        ("", [(6, 5)]),
+        ("scale_param { axis: 0 }", [(6, 5)]),
+        ("", [MAPS, (4,)]),
+    ],
     "LRN": [("", [MAPS])],
     "SoftmaxWithLoss": [
         ("", [(6, 5), (6,)]),
