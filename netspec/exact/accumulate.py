@@ -40,15 +40,12 @@ class Operation(Protocol):
     def backward(self) -> Callable[..., Diff]: ...
 
 
-def applied(operation: Operation, by_blas: bool, in_place: bool, bottom: Diff, *parameters: Diff) -> Any:
-    """Return the top of an operation, with gradients; ``in_place`` adds those of parameters to ``grad`` at once.
+class Applied(torch.autograd.Function):
+    """The top of an operation. With ``in_place``, the gradients of parameters are added to ``grad`` at once.
 
-    ``by_blas``: whether it calls the routines of netspec/exact/blas.py.
+    ``by_blas``: whether the operation calls the routines of netspec/exact/blas.py.
     """
-    return _Applied.apply(operation, by_blas, in_place, bottom, *parameters)
 
-
-class _Applied(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, operation: Operation, by_blas: bool, in_place: bool, bottom: Diff, *parameters: Diff
@@ -85,8 +82,8 @@ def _sum(parameter: torch.Tensor, adds: bool) -> torch.Tensor:
 
 def added_at_once(parameter: torch.Tensor) -> torch.Tensor:
     """Return a parameter for one use; the gradient of this use is added to ``grad`` as soon as it is known."""
-    is_learned = isinstance(parameter, torch.nn.Parameter) and parameter.requires_grad
-    return applied(_Use(), False, True, None, parameter) if is_learned and parameter.is_contiguous() else parameter
+    is_learned = isinstance(parameter, torch.nn.Parameter) and parameter.requires_grad and parameter.is_contiguous()
+    return Applied.apply(_Use(), False, True, None, parameter) if is_learned else parameter
 
 
 class _Use:

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from typing_extensions import override
 
 from netspec.exact import libm, losses, lrn, sums
-from netspec.exact.accumulate import Operation, added_at_once, applied
+from netspec.exact.accumulate import Applied, Operation, added_at_once
 from netspec.exact.blas import applies, is_recorded, sum_in_order
 from netspec.exact.by_torch import (
     normalized_batch,
@@ -59,7 +59,7 @@ class AsTorch:
         self.in_place = in_place
 
     def _applied(self, operation: Operation, bottom: torch.Tensor, *parameters: torch.Tensor | None) -> torch.Tensor:
-        return applied(operation, self.is_caffes, self.in_place, bottom, *parameters)
+        return Applied.apply(operation, self.is_caffes, self.in_place, bottom, *parameters)
 
     def _by_rows(self, products: Operation, vectors: torch.Tensor, *parameters: torch.Tensor | None) -> torch.Tensor:
         """Return the products of vectors (..., K) by an operation on vectors (M, K)."""

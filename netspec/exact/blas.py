@@ -78,6 +78,19 @@ def array(values: torch.Tensor) -> np.ndarray:
     return values.detach().numpy()
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """A block in which BLAS uses one thread. More threads would busy-wait, like torch's, and slow each other down."""
+    before = [(pool, count) for pool in _pools() if (count := pool.get_num_threads()) != 1]
+    for pool, _ in before:
+        pool.set_num_threads(1)
+    try:
+        yield
+    finally:
+        for pool, count in before:
+            pool.set_num_threads(count)
+
+
 def gemm(
     a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, *, a_t: bool = False, b_t: bool = False, add: bool = False
 ) -> None:
@@ -187,6 +200,7 @@ def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return dots(a.reshape(1, -1, 1), b.reshape(1, -1, 1)).view(())
 
 
+@one_thread()
 def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the sums (N, M) along axis 1 of the products of A and B, both (N, K, M) (caffe_cpu_strided_dot)."""
     count, length, stride = a.shape
@@ -201,6 +215,7 @@ def dots(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return a.new_tensor(found).view(count, stride)
 
 
+@one_thread()
 def sum_of_magnitudes(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of the absolute values, () (caffe_cpu_asum)."""
     values = values.contiguous()
@@ -212,29 +227,13 @@ def sum_of_magnitudes(values: torch.Tensor) -> torch.Tensor:
 def sum_of_squares(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of squares, () (caffe_cpu_dot of a blob with itself)."""
     flat = values.detach().flatten()
-    if not suits_blas(values):
-        return torch.dot(flat, flat)
-    with one_thread():
-        return dot(flat, flat)
+    return dot(flat, flat) if suits_blas(values) else torch.dot(flat, flat)
 
 
 def sum_in_order(values: torch.Tensor, axis: int = 0) -> torch.Tensor:
     """Return the sums along an axis, each value added to the sum of those before it (a plain loop of Caffe's)."""
     sums = np.add.accumulate(array(values), axis).take(-1, axis)
     return torch.as_tensor(sums, dtype=values.dtype)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """A block in which BLAS uses one thread. More threads would busy-wait, like torch's, and slow each other down."""
-    before = [(pool, count) for pool in _pools() if (count := pool.get_num_threads()) != 1]
-    for pool, _ in before:
-        pool.set_num_threads(1)
-    try:
-        yield
-    finally:
-        for pool, count in before:
-            pool.set_num_threads(count)
 
 
 def kernels() -> set[str]:

@@ -23,7 +23,6 @@ def softmax(scores: torch.Tensor) -> torch.Tensor:
     return p.div_(sums.unsqueeze(1))
 
 
-@one_thread()
 def softmax_gradient(p: torch.Tensor, diff: torch.Tensor) -> torch.Tensor:
     """Return the gradient of the scores from that of their softmax p, both (outer, classes, inner)."""
     return (diff - dots(diff, p).unsqueeze(1)) * p

@@ -10,38 +10,35 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from netspec.exact.blas import dots, one_thread, sum_in_order, sum_of_magnitudes
+from netspec.exact.blas import dots, sum_in_order, sum_of_magnitudes
 from netspec.exact.pointwise import pointwise
 
 
 def row_sums(rows: torch.Tensor, factor: float) -> torch.Tensor:
     """Return the sum of each row times a factor: its product with a constant vector (caffe_cpu_dot), (M, K) to (M,)."""
 
-    @one_thread()
     def compute(rows: torch.Tensor) -> torch.Tensor:
         return dots(rows.unsqueeze(2), torch.full_like(rows, factor).unsqueeze(2)).squeeze(1)
 
     return pointwise(rows, compute, lambda rows, _, diff: (diff * factor).unsqueeze(1).expand_as(rows))
 
 
-@one_thread()
-def _row_squares(rows: torch.Tensor) -> torch.Tensor:
-    return dots(rows.unsqueeze(2), rows.unsqueeze(2)).squeeze(1)
-
-
 def row_squares(rows: torch.Tensor) -> torch.Tensor:
     """Sum up the squares of each row (caffe_cpu_dot of it with itself): (M, K) to (M,)."""
-    return pointwise(rows, _row_squares, lambda rows, sums, diff: rows * (2 * diff).unsqueeze(1))
 
+    def compute(rows: torch.Tensor) -> torch.Tensor:
+        return dots(rows.unsqueeze(2), rows.unsqueeze(2)).squeeze(1)
 
-@one_thread()
-def _row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
-    return torch.stack([sum_of_magnitudes(row) for row in rows])
+    return pointwise(rows, compute, lambda rows, sums, diff: rows * (2 * diff).unsqueeze(1))
 
 
 def row_magnitudes(rows: torch.Tensor) -> torch.Tensor:
     """Sum up the absolute values of each row (caffe_cpu_asum): (M, K) to (M,)."""
-    return pointwise(rows, _row_magnitudes, lambda rows, sums, diff: rows.sign() * diff.unsqueeze(1))
+
+    def compute(rows: torch.Tensor) -> torch.Tensor:
+        return torch.stack([sum_of_magnitudes(row) for row in rows])
+
+    return pointwise(rows, compute, lambda rows, sums, diff: rows.sign() * diff.unsqueeze(1))
 
 
 class Copies(torch.autograd.Function):
