@@ -240,7 +240,8 @@ class Net(torch.nn.Module):
             advice = "read the file first, for example with cv2.imread" if isinstance(value, (str, Path)) else ""
             message = f"found {what} for an input; expected an array of numbers or a tensor"
             raise SpecError(f"{message}; {advice}" if advice else message, Where(self.plan.source.file))
-        return torch.as_tensor(array).to(self.device, dtype)
+        plain = array.astype(array.dtype.newbyteorder("="), order="C", copy=False)  # torch takes no negative strides
+        return torch.as_tensor(plain).to(self.device, dtype)
 
     def _values_to_keep(self) -> frozenset[int]:
         """Return the numbers of the values to keep: the outputs, and what ``keep`` says."""

@@ -168,7 +168,7 @@ class ConvolutionDepthwise(Convolution):
 
     def setup(self) -> None:
         self.read_geometry()
-        if self.spatial_axes != 2:
+        if self.spatial_axes != 2 or not self.bottom_shapes[0][self.channel_axis]:
             raise self.error(f"found a bottom of shape {self.bottom_shapes[0]}, expected (N, C, H, W)", "bottom")
         param = self.param.convolution_param
         self.channels = self.num_output = self.group = self.bottom_shapes[0][self.channel_axis]

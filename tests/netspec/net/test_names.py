@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import netspec
 from netspec.errors import SpecError
@@ -55,3 +56,12 @@ def test_an_input_that_is_not_an_array_is_refused(net: Net, value: object, says:
         net(value)
     assert str(fault.value).startswith("net.prototxt: ")
     assert says in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [np.array([[3.0, 2.0, 1.0]])[:, ::-1], np.array([[1, 2, 3]], ">f4"), [[1, 2, 3]]],
+    ids=["reversed", "big-endian", "list"],
+)
+def test_arrays_of_every_layout_are_taken(net: Net, value: object) -> None:
+    assert torch.equal(net(value)["prob"], net(np.array([[1.0, 2.0, 3.0]]))["prob"])
