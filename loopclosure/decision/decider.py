@@ -239,10 +239,7 @@ class Decider:
 
         The matches of lines of queries from ``new`` on are verified, if they were not before.
         """
-        best = self.lines.best()
-        part = slice(first, end)
-        values = (best.of, best.match, best.score, best.decoy, best.similar, best.wrong)
-        line = Best(best.courses, *(each[part] for each in values))
+        line = self.lines.best(first, end)
         self._look_at_lines(first, line, new)
         return self._decided(first, line)
 
@@ -300,6 +297,8 @@ class Decider:
             starts = lines[queries].any() or sure[queries].any()
             loops[queries] = lines[queries] | (starts & by_points)
             wrong[queries] = np.where(self.is_loop(wrong[queries]), wrong[queries], wrong[queries].min())
+        around = np.maximum.accumulate(np.where(lines & ~filled, np.arange(len(lines)), 0))
+        wrong[filled] = wrong[around[filled]]
         return Decision(
             match,
             loops,
@@ -405,14 +404,6 @@ def stretches(loops: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
         linked = linked[linked[:, 0] != linked[:, 1]]
     order = np.argsort(numbers[queries], kind="stable")
     return np.split(queries[order], np.flatnonzero(np.diff(numbers[queries][order])) + 1) if len(queries) else []
-
-
-def _grown(loops: np.ndarray, possible: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Return loops (Q,) with those of the ``possible`` ones that are neighbors of loops, and neighbors of these."""
-    found = np.zeros_like(loops)
-    for queries in stretches(loops | possible, pairs):
-        found[queries] = loops[queries].any()
-    return found
 
 
 def _between(loops: np.ndarray, match: np.ndarray, speed: np.ndarray, backwards: np.ndarray) -> np.ndarray:

@@ -66,7 +66,7 @@ class Lines:
         self._scores: list[np.ndarray] = []
         self._first = 0  # the query of the first of these
         self._width = 0  # references
-        self._pairs = [np.zeros(2) for _ in on]  # from which lines were chosen, and decoys
+        self._pairs = [np.zeros(3) for _ in on]  # from which lines were chosen, and decoys; the sum of their spreads
 
     def __len__(self) -> int:
         return len(self._found[0])
@@ -113,7 +113,8 @@ class Lines:
         match = own.argmax(axis=1)
         crossed = np.abs(np.arange(own.shape[1]) - match[:, None]) <= length  # these show the same place
         there = np.isfinite(own)
-        self._pairs[number] += there.sum(), (there & ~crossed).sum()
+        spread = sum(_spread(row[known]) for row, known in zip(own, there, strict=True))
+        self._pairs[number] += there.sum(), (there & ~crossed).sum(), spread
         decoy = np.where(crossed, NONE, other).max(axis=1)
         known = [row[np.isfinite(row)] for row in middle]
         chance = [np.median(row) if len(row) else 0.0 for row in known]
@@ -147,17 +148,17 @@ class Lines:
             [row[:length].astype(np.float32) for row, length in zip(of, lengths, strict=True)]
             for of in arrays["lines_rows"]
         )
-        self._pairs = list(arrays["lines_pairs"].astype(np.float64).reshape(len(self._found), 2))
+        self._pairs = list(arrays["lines_pairs"].astype(np.float64).reshape(len(self._found), 3))
         self._first, self._width = map(int, arrays["lines_first"])
 
-    def best(self) -> Best:
-        """Return the best line of each query by now, of the course on which chance makes one as good least often."""
+    def best(self, first: int, end: int) -> Best:
+        """Return the best lines of some queries by now, of the course on which chance makes one as good least often."""
         count = len(self)
         wrong, near = np.full((len(self.courses), count), np.inf), np.zeros((len(self.courses), count), bool)
         for number, course in enumerate(self.courses):
             wrong[number], near[number] = self._by_chance(number, course)
-        of = np.lexsort((wrong, ~near), axis=0)[0] if count else np.zeros(0, int)
-        each = np.arange(count)
+        of = np.lexsort((wrong, ~near), axis=0)[0, first:end] if count else np.zeros(0, int)
+        each = np.arange(count)[first:end]
         match, score, decoy, similar = (np.array([f.array[k] for f in self._found])[of, each] for k in (0, 1, 2, 5))
         return Best(self.courses, of, match.astype(int), score, decoy, similar, np.where(near, wrong, np.inf)[of, each])
 
@@ -165,17 +166,19 @@ class Lines:
         """Return how many wrong lines as good as that of each query (Q,) are expected in all, and whether it is near.
 
         Above a level the decoys are taken to fall exponentially (the peaks over a threshold of extreme-value theory),
-        with a scale that is widened by the uncertainty of the few independent decoys there are. Where too little is
-        known it is inf. Near is a line with the place itself on it: at the end of a loop, the line through its last
-        place is the best for a while.
+        with a scale that is widened by the uncertainty of the few independent decoys there are; inf where too little is
+        known. Scores that are already those of sequences vary more along lines in the direction of time, so decoys are
+        scaled by the ratio of the spreads, as far as it is known. Near is a line with the place itself on it: at the
+        end of a loop, the line through its last place is the best for a while.
         """
         _, score, decoy, middle, chance, _ = self._found[number].array
         wrong, decoys = np.full(len(score), np.inf), np.sort(decoy[np.isfinite(decoy)])[::-1]
-        pairs, chances = self._pairs[number]
+        (pairs, chances, spread), (*_, other) = self._pairs[number], self._pairs[number ^ 1]
         tail = max(LEAST_TAIL, int(TAIL * len(decoys)))
-        passed = self._width / course.speed  # steps
-        if len(decoys) * passed < LEAST_PIECES * course.length**2 or len(decoys) < 4 * LEAST_TAIL:
+        pieces = len(decoys) * self._width / course.speed / course.length**2
+        if pieces < LEAST_PIECES or len(decoys) < 4 * LEAST_TAIL:
             return wrong, np.zeros(len(score), bool)
+        decoys *= max(1.0, spread / (other + 1e-12)) ** (1 - LEAST_PIECES / pieces)
         level = decoys[tail]
         scale = (decoys[:tail] - level).mean() * (1 + np.sqrt(course.length / 2 / tail)) + 1e-12
         odds = max(1.0, pairs / max(1.0, chances)) * len(self.courses) / len(LENGTHS)
@@ -203,6 +206,11 @@ class Best:
     decoy: np.ndarray
     similar: np.ndarray
     wrong: np.ndarray
+
+
+def _spread(scores: np.ndarray) -> float:
+    """Return the median deviation of scores (n,), which the few lines of true loops do not change; 0 of none."""
+    return float(np.median(np.abs(scores - np.median(scores)))) if len(scores) else 0.0
 
 
 def _costs(distances: np.ndarray, course: Course, length: int, rows: range) -> np.ndarray:

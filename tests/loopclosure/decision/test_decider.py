@@ -10,6 +10,7 @@ from loopclosure.decision.constants import ALIKE, PRECISION, SURE, SURE_AMONG_AL
 from loopclosure.decision.decider import Decider, Decision, Settings
 from loopclosure.decision.lines import HALF
 from loopclosure.decision.points import look_alike, too_few, wrong_share
+from loopclosure.decision.trajectories import SequenceSettings, trajectory_costs
 from loopclosure.decision.visits import Usual, Visits, far_apart, outstanding
 from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures, Pairs
 from loopclosure.errors import InputError
@@ -104,6 +105,23 @@ def test_one_drive_with_one_revisit(known):
     assert wrong(found, np.arange(len(rows)) - 300, 5) == 0
     assert found.by_line[found.loops].all()
     assert (found.wrong[found.loops] <= 1 - PRECISION).all()
+
+
+def test_scores_of_sequences_make_no_loops_of_a_road_driven_once():
+    """SeqSLAM smooths its scores in the direction of time, so that lines of this direction stand out everywhere."""
+    rows = drive(200, 11)
+    earlier = np.tri(len(rows), k=-1, dtype=bool)
+    costs = trajectory_costs(np.where(earlier, -rows @ rows.T, np.nan), SequenceSettings(contrast=0))
+    assert not one_drive(rows, scores=np.where(earlier, -costs, np.nan)).loops.any()
+
+
+def test_a_loop_between_two_others_has_their_share_of_wrong_ones():
+    """No sequence passes four other frames, whose matches are on the line through those around them."""
+    queries = again(ROAD, 1.0, 2)
+    queries[60:64] = drive(4, 9)
+    found = traverses(queries, ROAD)
+    assert found.loops[61]
+    assert found.wrong[found.loops].max() <= 1 - PRECISION
 
 
 @pytest.mark.parametrize("frames", [1, 2, 12])
