@@ -74,19 +74,16 @@ class Convolution(convolution.Convolution):
         if holes and (param.dilation or holes not in (["hole"], ["hole_h", "hole_w"])):
             message = f"expected dilation, or hole, or both hole_h and hole_w; found {' and '.join(holes)}"
             raise self.error(message + (" and dilation" if param.dilation else ""), GROUP, holes[0])
-        if len(holes) == 2 and self.spatial_axes != 2:
-            raise self.error(f"hole_h is for 2 spatial axes, found {self.spatial_axes}; use hole", GROUP, "hole_h")
         if holes:
             self.dilation = tuple(value(param, name) for name in (holes * self.spatial_axes)[: self.spatial_axes])
             if min(self.dilation, default=1) < 1:
                 raise self.error(f"{holes[0]} must be at least 1", GROUP, holes[0])
         self.sides = [value(param, name) for name in SIDES]
-        if any(self.sides):
-            first = next(name for name in SIDES if value(param, name))
-            if any(self.pad):
-                raise self.error(f"found both pad and {first}; give one of them", GROUP, first)
-            if self.spatial_axes != 2:
-                raise self.error(f"{first} is for 2 spatial axes, the bottom has {self.spatial_axes}", GROUP, first)
+        first = next((name for name in (*SIDES, "hole_h") if value(param, name)), "")
+        if any(self.sides) and any(self.pad):
+            raise self.error(f"found both pad and {first}; give one of them", GROUP, first)
+        if first and self.spatial_axes != 2:
+            raise self.error(f"{first} is for 2 spatial axes, the bottom has {self.spatial_axes}", GROUP, first)
 
     def _padded_shape(self, shape: Shape) -> Shape:
         """Return a bottom's shape including the pads of its sides."""
