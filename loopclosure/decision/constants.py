@@ -26,8 +26,8 @@ TAIL = 0.1  # share of the decoys that the tail is fitted to, and at least so ma
 LEAST_TAIL = 5
 
 # Points
-SURE = 1.5  # the evidence of an image that is a loop; once is not enough: the windows of a facade repeat
-SURE_AMONG_ALIKE = 2.5  # the same, where places look alike, and of an image that no verified one is next to
+SURE = 1.5  # the evidence of a single image that is a loop; once is not enough: the windows of a facade repeat
+SURE_AMONG_ALIKE = 2.5  # the same, where places look alike
 DECADE = 0.5  # so much more evidence is wrong a tenth as often
 ALIKE = 0.25  # of the matches with enough points: if more of them agree only in part, places look alike
 LEAST_VERIFIED = 3  # fewer verified matches of a stretch do not tell whether they agree only in part; by hand

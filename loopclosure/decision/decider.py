@@ -16,7 +16,7 @@ import numpy as np
 
 from loopclosure.decision.constants import AGES, PRECISION, SAMPLE, SURE, VELOCITIES, WINDOW
 from loopclosure.decision.growing import Growing
-from loopclosure.decision.lines import HALF, Best, Course, Lines, courses, neighbors
+from loopclosure.decision.lines import Best, Course, Lines, courses, neighbors
 from loopclosure.decision.points import in_part, look_alike, too_few, wrong_share
 from loopclosure.decision.visits import Usual, Visits, outstanding
 from loopclosure.errors import InputError
@@ -221,8 +221,7 @@ class Decider:
                 break
             found = self._verified(query, reference)
             _, evidence, inliers, whole = found.tolist()
-            doubtful = self.alike or self._alone(query, reference)
-            wrong = float(wrong_share(np.array([evidence]), doubtful)[0]) if whole else 1.0
+            wrong = float(wrong_share(np.array([evidence]), self.alike)[0]) if whole else 1.0
             new = Looked(reference, int(inliers), wrong, bool(evidence >= SURE and not whole))
             if looked.inliers is None or new.wrong < looked.wrong:
                 looked = new
@@ -230,13 +229,6 @@ class Decider:
             if self.is_loop(wrong):
                 break
         return looked
-
-    def _alone(self, query: int, reference: int) -> bool:
-        """Return whether no verified image of the ``HALF`` queries before one is on a line with it."""
-        match, evidence = self._image.array[:2, max(0, query - HALF) : query]
-        way, moved = np.arange(len(match), 0, -1), np.abs(reference - match)
-        near = (VELOCITIES[0] * way - WINDOW <= moved) & (moved <= VELOCITIES[1] * way + WINDOW)
-        return not (near & (evidence >= 1)).any()
 
     def is_loop(self, wrong: np.ndarray | float) -> Any:
         """Return whether so small a share of wrong ones is what is asked for."""
@@ -248,17 +240,22 @@ class Decider:
         The matches of lines of queries from ``new`` on are verified, if they were not before.
         """
         line = self.lines.best(first, end)
-        near = np.isfinite(line.wrong) & (np.arange(first, end) >= new)
+        self._look_at_lines(first, line, new)
+        return self._decided(first, line)
+
+    def _look_at_lines(self, first: int, line: Best, new: int) -> None:
+        """Verify the matches of lines of queries from ``new`` on, in so far as they are not verified yet."""
+        near = np.isfinite(line.wrong) & (np.arange(first, first + len(line.match)) >= new)
         for k in np.flatnonzero((line.match >= 0) & near).tolist() if self._agree else ():
             query, match = first + k, int(line.match[k])
             if self._line.array[0, query] != match:
                 same = self._image.array[0, query] == match
                 self._line.array[:, query] = self._image.array[:, query] if same else self._verified(query, match)
-        return self._decided(first, line)
 
     def _decided(self, first: int, line: Best) -> Decision:
         part = slice(first, first + len(line.match))
-        (single, similar), image = self._single.array[:, part], self._image.array[:, part]
+        single, similar = self._single.array[:, part]
+        image = self._image.array[:, part]
         single = np.where(np.isfinite(image[0]), image[0], single).astype(int)
         by_line = np.where(self._line.array[0, part] == line.match, self._line.array[1:, part], np.nan)
         # A line is looked at further where in the whole drive less than one as good is expected by chance, or so many
@@ -270,15 +267,13 @@ class Decider:
         match = np.where(of_line, line.match, single)
         evidence, inliers, whole = np.where(of_line, by_line, image[1:])
         verified, whole = evidence >= 1, whole > 0
+        image_wrong = np.where(whole, wrong_share(np.nan_to_num(evidence), self.alike), 1.0)
+        sure = self.is_loop(image_wrong)
         course = [line.courses[k] for k in line.of]
         speed, back = np.array([c.speed for c in course]), np.array([c.backwards for c in course], bool)
         length = np.array([c.length for c in course], float)
         pairs = neighbors(match, speed, back)
         pairs = pairs[(match[pairs] >= 0).all(axis=1)]
-        alone = np.ones_like(verified)
-        alone[pairs[verified[pairs].all(axis=1)]] = False
-        image_wrong = np.where(whole, wrong_share(np.nan_to_num(evidence), alone | self.alike), 1.0)
-        sure = self.is_loop(image_wrong)
         # Of the stretches, those are loops of which as many wrong ones are expected as the precision allows.
         found, wrong = np.zeros_like(member), np.ones(len(match))
         made = stretches(member, pairs)
@@ -290,8 +285,7 @@ class Decider:
             passed = VELOCITIES[0] * (length * speed)[queries].min()
             enough = (1 / length[queries]).sum() >= 1 and len(np.unique(match[queries])) >= passed
             found[queries] = (enough and self.is_loop(share)) or sure[queries].any()
-        known = line.similar, verified, whole & verified
-        fell = _fallen(found, verified, pairs, length, lambda run: self._against(first, run, *known))
+        fell = self._fallen(first, found, line.similar, verified, whole & verified, pairs, length)
         lines = found & ~fell
         filled = _between(lines, line.match, speed, back) & ~lines & ~sure
         lines, match = lines | filled, np.where(filled, line.match, match)
@@ -318,6 +312,34 @@ class Decider:
             similar,
         )
 
+    def _fallen(
+        self,
+        first: int,
+        found: np.ndarray,
+        similar: np.ndarray,
+        verified: np.ndarray,
+        whole: np.ndarray,
+        pairs: np.ndarray,
+        length: np.ndarray,
+    ) -> np.ndarray:
+        """Return the loops of lines that points speak against: ends of stretches, and whole ones.
+
+        An end is a run without a verified match. One that is longer than a line is several lines, which tell enough:
+        half a drive may be in another light. A shorter one may be the end of the line through the last place of a loop.
+        """
+        fell = np.zeros_like(found)
+        if self._agree is None:
+            return fell
+        for queries in stretches(found, pairs):
+            seen = np.flatnonzero(verified[queries])
+            start, end = (seen[0], seen[-1] + 1) if len(seen) else (0, len(queries))
+            for run in (queries[:start], queries[end:]):
+                if len(run):
+                    fell[run] = len(run) <= length[run].max() and self._against(first, run, similar, verified, whole)
+            rest = queries[~fell[queries]]
+            fell[rest] = self._against(first, rest, similar, verified, whole)
+        return fell
+
     def _against(
         self, first: int, run: np.ndarray, similar: np.ndarray, verified: np.ndarray, whole: np.ndarray
     ) -> bool:
@@ -325,7 +347,7 @@ class Decider:
         hits = int(np.count_nonzero(verified[run]))
         if in_part(hits, np.count_nonzero(whole[run])):
             return True
-        if self._agree is None or self._among is None or 2 * hits >= len(run):
+        if self._among is None or 2 * hits >= len(run):
             return False
         step = 2 ** max(0, int(np.ceil(np.log2(len(run) / SAMPLE))))  # the same ones while the run grows
         some = run[(first + run) % step == 0]
@@ -382,26 +404,6 @@ def stretches(loops: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
         linked = linked[linked[:, 0] != linked[:, 1]]
     order = np.argsort(numbers[queries], kind="stable")
     return np.split(queries[order], np.flatnonzero(np.diff(numbers[queries][order])) + 1) if len(queries) else []
-
-
-def _fallen(
-    loops: np.ndarray, verified: np.ndarray, pairs: np.ndarray, length: np.ndarray, against: Callable[[Any], bool]
-) -> np.ndarray:
-    """Return the loops (Q,) of lines that points speak against: ends of stretches, and whole ones.
-
-    An end is a run without a verified match. One that is longer than a line is several lines, which tell enough:
-    half a drive may be in another light. A shorter one may be the end of the line through the last place of a loop.
-    """
-    fell = np.zeros_like(loops)
-    for queries in stretches(loops, pairs):
-        seen = np.flatnonzero(verified[queries])
-        start, end = (seen[0], seen[-1] + 1) if len(seen) else (0, len(queries))
-        for run in (queries[:start], queries[end:]):
-            if len(run):
-                fell[run] = len(run) <= length[run].max() and against(run)
-        rest = queries[~fell[queries]]
-        fell[rest] = against(rest)
-    return fell
 
 
 def _between(loops: np.ndarray, match: np.ndarray, speed: np.ndarray, backwards: np.ndarray) -> np.ndarray:

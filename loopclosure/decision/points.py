@@ -27,12 +27,9 @@ def look_alike(part: int | np.integer, many: int | np.integer) -> bool:
     return bool(part + 1 > ALIKE * (many + 2))
 
 
-def wrong_share(evidence: np.ndarray, doubtful: np.ndarray | bool) -> np.ndarray:
-    """Return the share (n,) of wrong ones that is expected among images with this evidence.
-
-    doubtful  (n,) places look alike, or no image next to it is verified
-    """
-    asked = np.where(doubtful, SURE_AMONG_ALIKE, SURE)
+def wrong_share(evidence: np.ndarray, alike: bool) -> np.ndarray:
+    """Return the share (n,) of wrong ones that is expected among single images with this evidence."""
+    asked = SURE_AMONG_ALIKE if alike else SURE
     return np.minimum(1, (1 - PRECISION) * 10 ** (-(evidence - asked) / DECADE))
 
 
