@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 OPTIONAL = ("fast", "dialects", "export", "compat", "inspect")
 RANDOM_NETS = 30
-MOST_LINES = 18_035  # of Python in the core
+MOST_LINES = 18_036  # of Python in the core
 NOT_CORE = (*OPTIONAL, "cli", "terminal", "pycaffe.py", "dnn.py")
 
 
