@@ -1,7 +1,8 @@
 """Measures what loopclosure finds on real drives that come back, and on drives that do not: ``tools/bench revisits``.
 
 Each drive is decided as ``detect`` decides it, frame by frame as ``LoopDetector`` does, and in thirds: each third of a
-drive is asked of the other two, as ``map query`` does. Nothing is warped, relit or rendered.
+drive is asked of the other two, as ``map query`` does. Beside them stands what many robots do: the most similar image
+by a bag of ORB words, if a fundamental matrix agrees. Nothing is warped, relit or rendered.
 """
 
 from __future__ import annotations
@@ -13,21 +14,25 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from benchmarks import results
 from benchmarks.cache import Cache
 from benchmarks.pages import RESULTS
+from benchmarks.tables import tower_images
 from loopclosure.decision.constants import PRECISION
 from loopclosure.descriptors.similarity import similarity_matrix
 from loopclosure.detector.detector import LoopDetector
 from loopclosure.detector.verification import Agreement, GeometricCheck, LocalFeatures, Pairs
-from loopclosure.methods.base import earlier
+from loopclosure.methods.base import Images, earlier
 from loopclosure.methods.drive import Drive, Request, speeds_between
+from loopclosure.methods.named import make_method
 from loopclosure.places.datasets import load_folder
-from loopclosure.places.frames import image_paths
+from loopclosure.places.frames import image_paths, read_gray
 from loopclosure.places.same_place import MAX_ANGLE_DEG, MAX_DISTANCE_M, same_place_matrix
 from loopclosure.places.sequences import read_sequence
+from loopclosure.progress import silent
 
 GAP = 30  # frames nearer than this in one drive are not a loop
 NEAR, OVERLAP = 1, 4  # frames of one route: the same place, and views that overlap
@@ -38,6 +43,7 @@ FIRST += ("corridor", "nordland_2", "road: bridge_highway")
 # Handheld, and laps of small robots; where they come back is not known, so only what is accepted is counted.
 UNJUDGED = ("office_handheld_loop", "rc_exhibition_hall", "rc_hall_stone_floor", "rc_office_corridor")
 OVERLAPS = 0.25, 0.05  # of the footprint of a drone's image that another sees: the same place, and no mistake
+RECENT, INLIERS, RATIO = 20, 20, 0.8  # of the ORB words: frames that are no references; of the matrix; of the matches
 DESK_GAP = 90  # frames, 3 s: a hand-held camera turns to and fro
 HALVES = {"nordland_1": slice(596), "nordland_2": slice(596, None)}
 FLOORS = {"3 to 12": range(3, 13), "13 to 23": range(13, 24)}
@@ -52,6 +58,7 @@ class Real:
     wide    what is no mistake: less than 45 degrees apart
     judged  pairs that count
     known   whether it is known where the drive comes back
+    train   images of other places, for words
     """
 
     name: str
@@ -61,6 +68,7 @@ class Real:
     judged: np.ndarray
     gap: int = GAP
     known: bool = True
+    train: Sequence[Path] = ()
 
     def third(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the frames of a third, 0 to 2, and the others."""
@@ -73,7 +81,10 @@ def drives(data: Path, only: Sequence[str] = ()) -> Iterator[Real]:
     """Yield the drives in the folder ``data``: all, or those with a name that begins as one of ``only``."""
     for name, load in _drives(data).items():
         if not only or name.startswith(tuple(only)):
-            yield replace(load(), name=name)
+            rooms = sorted((data / "seven_scenes").glob("chess_*"))
+            others = [path for room in rooms for path in read_sequence(room, "tum").paths]
+            train = others[::2] if name.startswith("tower") else tower_images(data / "ie_tower")[::4]
+            yield replace(load(), name=name, train=train)
 
 
 def _drives(data: Path) -> dict[str, Callable[[], Real]]:
@@ -235,7 +246,35 @@ def online(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
     return match
 
 
-HOW = {"detect": as_detect, "map query": as_query, "online": online}
+def by_orb(real: Real, rows: np.ndarray, cache: Cache) -> np.ndarray:
+    """Return the match of each frame (N,), -1 without one: the most similar by ORB words, if enough points agree."""
+    words = {"bow.kind": "orb", "bow.model": str(cache.path.with_name(f"orb_{len(real.train)}.npz"))}
+    images = Images.of_files(real.images, train=real.train)
+    scores = make_method("bow", settings=words).score(images, silent).scores
+    scores = np.where(earlier(len(scores), max(real.gap, RECENT)), scores, -np.inf)
+    orb, matcher = cv2.ORB.create(1000), cv2.BFMatcher(cv2.NORM_HAMMING)
+    points = [orb.detectAndCompute(read_gray(path), None) for path in real.images]  # type: ignore[call-overload]
+    match = np.full(len(scores), -1)
+    for query, best in enumerate(scores.argmax(axis=1).tolist()):
+        if np.isfinite(scores[query, best]) and _agreeing(matcher, points[query], points[best]) >= INLIERS:
+            match[query] = best
+    return match
+
+
+def _agreeing(matcher: Any, a: Any, b: Any) -> int:
+    """Return how many ORB points of two images agree with one fundamental matrix."""
+    if a[1] is None or b[1] is None:
+        return 0
+    pairs = [pair for pair in matcher.knnMatch(a[1], b[1], k=2) if len(pair) == 2]
+    good = [first for first, second in pairs if first.distance < RATIO * second.distance]
+    if len(good) < INLIERS:
+        return 0
+    ends = (np.array([a[0][m.queryIdx].pt for m in good]), np.array([b[0][m.trainIdx].pt for m in good]))
+    _, agree = cv2.findFundamentalMat(*ends, cv2.FM_RANSAC, 3.0, 0.99)
+    return 0 if agree is None else int(agree.sum())
+
+
+HOW = {"detect": as_detect, "map query": as_query, "online": online, "ORB words": by_orb}
 
 
 def judged(real: Real, match: np.ndarray, how: str) -> dict[str, Any]:
