@@ -176,7 +176,7 @@ def _function(name: str, dtype: torch.dtype) -> Callable[..., Any]:
 
 
 def _count(*matrices: torch.Tensor) -> int:
-    return max([len(m) for m in matrices if m.dim() == 3], default=1)
+    return max([m.shape[0] for m in matrices if m.dim() == 3], default=1)  # len(m) takes as long as a small product
 
 
 def _without_gaps(matrices: torch.Tensor) -> torch.Tensor:

@@ -56,8 +56,8 @@ class Filter(NamedTuple):
         windows = _windows(self, maps.shape[1], maps.shape[2:])
         if any(self.pad):
             maps = F.pad(maps, [p for pad in reversed(self.pad) for p in (pad, pad)])
-        pixels = maps.contiguous().as_strided((len(maps), *windows.layout), windows.strides)
-        return pixels.reshape(len(maps), windows.pixels, windows.positions)
+        pixels = maps.contiguous().as_strided((maps.shape[0], *windows.layout), windows.strides)
+        return pixels.reshape(maps.shape[0], windows.pixels, windows.positions)
 
     def spread(self, columns: torch.Tensor, size: Axes) -> torch.Tensor:
         """Add columns up to maps (N, C, size), one pixel of the filter at a time (col2im).
@@ -66,7 +66,7 @@ class Filter(NamedTuple):
         """
         if len(size) == 2:
             return F.fold(columns, size, self.kernel, self.dilation, self.pad, self.stride)
-        count, positions = len(columns), self.fits(size)
+        count, positions = columns.shape[0], self.fits(size)
         pixels = columns.view(count, -1, *self.kernel, *positions)
         padded = columns.new_zeros(count, pixels.shape[1], *(n + 2 * p for n, p in zip(size, self.pad, strict=True)))
         every = (slice(None), slice(None))
@@ -118,12 +118,12 @@ class ColumnProducts:
 
     def forward(self, maps: torch.Tensor, weight: torch.Tensor, bias: Diff = None) -> torch.Tensor:
         filters, windows = weight.contiguous().flatten(1), _windows(self.sliding, maps.shape[1], maps.shape[2:])
-        tops = maps.new_empty((len(maps), len(weight), windows.positions))
+        tops = maps.new_empty((maps.shape[0], weight.shape[0], windows.positions))
         for some, top in self._in_parts(maps, tops):
             self._multiply(filters, self.sliding.columns(some), top)
         if bias is not None:
             tops.add_(bias.unsqueeze(1))
-        return tops.view(len(maps), len(weight), *windows.fits)
+        return tops.view(maps.shape[0], weight.shape[0], *windows.fits)
 
     def backward(
         self, diff: torch.Tensor, wanted: bool, sums: Sums, maps: torch.Tensor, weight: torch.Tensor, *_: Diff
@@ -135,9 +135,9 @@ class ColumnProducts:
     def spread(self, values: torch.Tensor, weight: torch.Tensor, size: Axes) -> torch.Tensor:
         """Return the products (N, C, size) of the transposed filters with values (N, num_output, ...), added up."""
         filters = weight.contiguous().flatten(1)
-        maps = values.new_empty(len(values), self.group * weight.shape[1], *size)
+        maps = values.new_empty(values.shape[0], self.group * weight.shape[1], *size)
         for some, few in self._in_parts(maps, values.flatten(2)):
-            columns = few.new_empty(len(few), self.group * filters.shape[1], few.shape[2])
+            columns = few.new_empty(few.shape[0], self.group * filters.shape[1], few.shape[2])
             self._multiply(filters, few, columns, a_t=True)
             some.copy_(self.sliding.spread(columns, size))
         return maps
@@ -154,7 +154,7 @@ class ColumnProducts:
     def _in_parts(self, maps: torch.Tensor, others: torch.Tensor) -> Iterable[tuple[torch.Tensor, torch.Tensor]]:
         """Return a batch in parts with columns that fit into a CPU's cache."""
         at_once = _windows(self.sliding, maps.shape[1], maps.shape[2:]).at_once
-        if at_once >= len(maps):
+        if at_once >= maps.shape[0]:
             return [(maps, others)]
         return zip(maps.split(at_once), others.split(at_once), strict=True)
 
