@@ -72,111 +72,143 @@ class _Verbose(argparse.Action):
             setattr(namespace, name, value)
 
 
-SHARED: dict[str, dict[str, dict[str, Any]]] = {  # by group: the settings of each option, for argparse
-    "plugin": {
-        "--plugin": {
-            "action": "append",
-            "default": [],
-            "metavar": "NAME|FILE.py",
-            "help": "a dialect (the layers of a fork of Caffe), by name or as a Python file; may be repeated",
-        }
-    },
-    "limit": {
-        "--limit": {
-            "type": _amount,
-            "metavar": "SIZE",
-            "help": "refuse a net that needs more memory than this, e.g. 64GiB (default: the machine's memory)",
-        }
-    },
-    "verbose": {"-v --verbose": {"nargs": 0, "action": _Verbose, "help": "show Caffe's log"}},
-    "net": {  # model() reads them
-        "net": {"nargs": "?", "metavar": "NET", "help": "the net's prototxt"},
-        "--model": {"metavar": "MODEL", "help": "the net's prototxt, as an option like Caffe's"},
-    },
-    "gpu": {"--gpu": {"default": "", "metavar": "GPU", "help": "number of the GPU to use (default: the CPU)"}},
-    "phase": {
-        "--phase": {
-            "type": str.upper,
-            "default": "TEST",
-            "choices": ["TEST", "TRAIN"],
-            "help": "phase of the net (default: %(default)s)",
-        }
-    },
-    "state": {
-        "--level": {
-            "type": _int32,
-            "default": 0,
-            "metavar": "LEVEL",
-            "help": "level of the NetState (default: %(default)s)",
-        },
-        "--stage": {"default": "", "metavar": "STAGE", "help": "stages of the NetState, separated by commas"},
-    },
-    "blob": {"--blob": {"action": "extend", "nargs": "+", "default": [], "metavar": "BLOB"}},
-    "shape": {"--shape": {"action": "append", "type": blob_shape, "default": [], "metavar": "BLOB=N,C,H,W"}},
-    "pixels": {  # in this order
-        "--swap": {"action": "store_true", "help": "reverse the channels: from BGR to RGB, or back"},
-        "--raw-scale": {
-            "type": float,
-            "default": 1.0,
-            "metavar": "S",
-            "help": "then multiply the pixels (0 to 255) by this",
-        },
-        "--mean": {
-            "metavar": "A,B,C|FILE",
-            "help": "then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
-        },
-        "--scale": {"type": float, "default": 1.0, "metavar": "S", "help": "then multiply by this"},
-    },
-    "data": {"--data": {"action": "store_true", "help": "open databases, lists and mean files"}},
-    "strict": {"--strict": {"action": "store_true", "help": "refuse weights that lack a layer of the net"}},
-    "python": {
-        "--allow-python-layers": {"action": "store_true", "help": "allow the net's Python layers to run their code"}
-    },
-    "iterations": {
-        "--iterations": {
-            "type": positive,
-            "default": 50,
-            "metavar": "N",
-            "help": "batches to run (default: %(default)s)",
-        }
-    },
-    "exact": {
-        "--exact": {
-            "default": BuildOptions.exact,
-            "choices": EXACT,
-            "help": "which sums are bit-identical to Caffe's on the CPU; all is slower (default: %(default)s)",
-        }
-    },
-    "passes": {
-        "--passes": {
-            "type": _passes,
-            "default": PASSES,
-            "metavar": "NAMES",
-            "help": f"optimizations for a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
-        }
-    },
-    "engine": {  # run_by() reads them
-        "--engine": {
-            "default": TORCH,
-            "choices": [*ENGINES, f"{OPENVINO},{BF16}"],
-            "metavar": "NAME",
-            "help": f"engine that runs the net: {', '.join(ENGINES)} or {OPENVINO},{BF16}, which computes in bfloat16 "
-            "(default: %(default)s)",
-        },
-        "--precision": {"choices": PRECISIONS, "help": argparse.SUPPRESS},
-        "--cache": {
-            "metavar": "DIR|none",
-            "help": "folder to keep exported nets in, or none (default: the user's cache folder)",
-        },
-    },
-}
+def add_plugin(parser: argparse.ArgumentParser) -> None:
+    """Add ``--plugin``, for commands that read nets; :func:`use_dialects` reads it."""
+    parser.add_argument(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="NAME|FILE.py",
+        help="a dialect (the layers of a fork of Caffe), by name or as a Python file; may be repeated",
+    )
 
 
-def add(parser: argparse._ActionsContainer, *groups: str, **changed: Any) -> None:
-    """Add groups of :data:`SHARED`; ``changed`` are other settings of their options."""
-    for group in groups:
-        for names, settings in SHARED[group].items():
-            parser.add_argument(*names.split(), **{**settings, **changed})
+def add_limit(parser: argparse.ArgumentParser) -> None:
+    """Add ``--limit``, for commands that build nets."""
+    parser.add_argument(
+        "--limit",
+        type=_amount,
+        metavar="SIZE",
+        help="refuse a net that needs more memory than this, e.g. 64GiB (default: the machine's memory)",
+    )
+
+
+def add_verbose(parser: argparse.ArgumentParser) -> None:
+    """Add ``-v``, for commands that build nets and otherwise show only warnings."""
+    parser.add_argument("-v", "--verbose", nargs=0, action=_Verbose, help="show Caffe's log")
+
+
+def add_net(parser: argparse.ArgumentParser) -> None:
+    """Add the net's prototxt, as an argument and as ``--model``; :func:`model` reads them."""
+    parser.add_argument("net", nargs="?", metavar="NET", help="the net's prototxt")
+    parser.add_argument("--model", metavar="MODEL", help="the net's prototxt, as an option like Caffe's")
+
+
+def add_gpu(parser: argparse.ArgumentParser, text: str = "number of the GPU to use (default: the CPU)") -> None:
+    """Add ``--gpu``."""
+    parser.add_argument("--gpu", default="", metavar="GPU", help=text)
+
+
+def add_phase(
+    parser: argparse.ArgumentParser, default: str | None = "TEST", text: str = "phase of the net (default: %(default)s)"
+) -> None:
+    """Add ``--phase``."""
+    parser.add_argument("--phase", type=str.upper, default=default, choices=["TEST", "TRAIN"], help=text)
+
+
+def add_state(parser: argparse.ArgumentParser) -> None:
+    """Add ``--level`` and ``--stage``."""
+    parser.add_argument(
+        "--level", type=_int32, default=0, metavar="LEVEL", help="level of the NetState (default: %(default)s)"
+    )
+    parser.add_argument("--stage", default="", metavar="STAGE", help="stages of the NetState, separated by commas")
+
+
+def add_blob(parser: argparse.ArgumentParser, text: str, required: bool = False) -> None:
+    """Add ``--blob``, which takes several names and may be repeated."""
+    parser.add_argument("--blob", action="extend", nargs="+", default=[], required=required, metavar="BLOB", help=text)
+
+
+def add_shape(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add ``--shape``, which may be repeated."""
+    parser.add_argument("--shape", action="append", type=blob_shape, default=[], metavar="BLOB=N,C,H,W", help=text)
+
+
+def add_pixels(group: argparse._ArgumentGroup) -> None:
+    """Add what is done with the pixels of image files, in this order."""
+    group.add_argument("--swap", action="store_true", help="reverse the channels: from BGR to RGB, or back")
+    group.add_argument(
+        "--raw-scale", type=float, default=1.0, metavar="S", help="then multiply the pixels (0 to 255) by this"
+    )
+    group.add_argument(
+        "--mean",
+        metavar="A,B,C|FILE",
+        help="then subtract this: one number per channel, in the net's order, or a .binaryproto or .npy file",
+    )
+    group.add_argument("--scale", type=float, default=1.0, metavar="S", help="then multiply by this")
+
+
+def add_data(parser: argparse.ArgumentParser, text: str = "open databases, lists and mean files") -> None:
+    """Add ``--data``."""
+    parser.add_argument("--data", action="store_true", help=text)
+
+
+def add_strict(parser: argparse.ArgumentParser) -> None:
+    """Add ``--strict``."""
+    parser.add_argument("--strict", action="store_true", help="refuse weights that lack a layer of the net")
+
+
+def add_python(parser: argparse.ArgumentParser) -> None:
+    """Add ``--allow-python-layers``."""
+    parser.add_argument(
+        "--allow-python-layers", action="store_true", help="allow the net's Python layers to run their code"
+    )
+
+
+def add_iterations(parser: argparse.ArgumentParser) -> None:
+    """Add ``--iterations``."""
+    parser.add_argument(
+        "--iterations", type=positive, default=50, metavar="N", help="batches to run (default: %(default)s)"
+    )
+
+
+def add_exact(parser: argparse.ArgumentParser) -> None:
+    """Add ``--exact``."""
+    parser.add_argument(
+        "--exact",
+        default=BuildOptions.exact,
+        choices=EXACT,
+        help="which sums are bit-identical to Caffe's on the CPU; all is slower (default: %(default)s)",
+    )
+
+
+def add_passes(parser: argparse.ArgumentParser) -> None:
+    """Add ``--passes``."""
+    parser.add_argument(
+        "--passes",
+        type=_passes,
+        default=PASSES,
+        metavar="NAMES",
+        help=f"optimizations for a net of phase TEST: {','.join(PASSES)} (the default), some of these, or none",
+    )
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add ``--engine`` and its options; :func:`run_by` reads them."""
+    parser.add_argument(
+        "--engine",
+        default=TORCH,
+        choices=[*ENGINES, f"{OPENVINO},{BF16}"],
+        metavar="NAME",
+        help=f"engine that runs the net: {', '.join(ENGINES)} or {OPENVINO},{BF16}, which computes in bfloat16 "
+        "(default: %(default)s)",
+    )
+    parser.add_argument("--precision", choices=PRECISIONS, help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--cache",
+        metavar="DIR|none",
+        help="folder to keep exported nets in, or none (default: the user's cache folder)",
+    )
 
 
 def use_dialects(arguments: argparse.Namespace) -> None:

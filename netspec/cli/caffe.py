@@ -13,7 +13,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netspec import log
-from netspec.cli.arguments import add, devices, load, options, run_by, stages
+from netspec.cli.arguments import (
+    add_engine,
+    add_exact,
+    add_gpu,
+    add_iterations,
+    add_limit,
+    add_net,
+    add_passes,
+    add_phase,
+    add_plugin,
+    add_python,
+    add_state,
+    add_strict,
+    devices,
+    load,
+    options,
+    run_by,
+    stages,
+)
 from netspec.cli.scores import Score, Scores
 from netspec.errors import SpecError
 from netspec.proto.binary import check_readable, split_paths
@@ -37,7 +55,8 @@ BAR = "{n_fmt} of {total_fmt} |{bar}| {elapsed}, {remaining} left{postfix}"
 
 def _add_train(commands: Commands) -> None:
     parser = commands.add_parser("train", _train, help="train or fine-tune a model (caffe train)")
-    add(parser, "plugin", "limit")
+    add_plugin(parser)
+    add_limit(parser)
     parser.add_argument("path", nargs="?", metavar="SOLVER", help="the solver's prototxt")
     parser.add_argument("--solver", metavar="SOLVER", help="the solver's prototxt")
     parser.add_argument("--snapshot", metavar="SNAPSHOT", help="a .solverstate to resume from")
@@ -60,10 +79,8 @@ def _add_train(commands: Commands) -> None:
         choices=["stop", "warn"],
         help="what to do when the loss is NaN or infinite (default: %(default)s)",
     )
-    add(
-        parser, "gpu", help="number of the GPU, several separated by commas, or all (default: the device in the solver)"
-    )
-    add(parser, "state")
+    add_gpu(parser, text="number of the GPU, several separated by commas, or all (default: the device in the solver)")
+    add_state(parser)
     parser.add_argument(
         "--sigint_effect",
         default="stop",
@@ -76,7 +93,8 @@ def _add_train(commands: Commands) -> None:
         choices=["stop", "snapshot", "none"],
         help="what SIGHUP does (default: %(default)s)",
     )
-    add(parser, "python", "exact")
+    add_python(parser)
+    add_exact(parser)
     parser.add_argument(
         "--precision",
         default="fp32",
@@ -84,7 +102,7 @@ def _add_train(commands: Commands) -> None:
         help="precision of forward and backward passes; bf16 is faster on CPUs and GPUs that support it, fp16 on "
         "GPUs; both are less accurate (default: %(default)s)",
     )
-    add(parser, "strict")
+    add_strict(parser)
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -242,11 +260,19 @@ def _signals(effects: Mapping[signal.Signals, str]) -> Iterator[_Signals]:
 
 def _add_test(commands: Commands) -> None:
     parser = commands.add_parser("test", _test, help="score a model on its TEST-phase data (caffe test)")
-    add(parser, "plugin", "limit", "net")
+    add_plugin(parser)
+    add_limit(parser)
+    add_net(parser)
     parser.add_argument("--weights", required=True, metavar="WEIGHTS", help="the trained weights")
-    add(parser, "iterations")
+    add_iterations(parser)
     parser.add_output("--scores", metavar="F.json", help="also write the mean scores to this file")
-    add(parser, "gpu", "state", "python", "exact", "passes", "strict", "engine")
+    add_gpu(parser)
+    add_state(parser)
+    add_python(parser)
+    add_exact(parser)
+    add_passes(parser)
+    add_strict(parser)
+    add_engine(parser)
 
 
 def _test(arguments: argparse.Namespace) -> None:
@@ -265,9 +291,16 @@ def _test(arguments: argparse.Namespace) -> None:
 
 def _add_time(commands: Commands) -> None:
     parser = commands.add_parser("time", _time, help="measure the forward and backward time of each layer (caffe time)")
-    add(parser, "plugin", "limit", "net", "iterations", "gpu")
-    add(parser, "phase", default="TRAIN")
-    add(parser, "state", "python", "exact", "engine")
+    add_plugin(parser)
+    add_limit(parser)
+    add_net(parser)
+    add_iterations(parser)
+    add_gpu(parser)
+    add_phase(parser, default="TRAIN")
+    add_state(parser)
+    add_python(parser)
+    add_exact(parser)
+    add_engine(parser)
 
 
 def _time(arguments: argparse.Namespace) -> None:

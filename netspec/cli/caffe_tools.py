@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 
 from netspec import log
-from netspec.cli.arguments import add, device, options, positive
+from netspec.cli.arguments import add_limit, add_plugin, device, options, positive
 from netspec.files.whole_file import write_whole
 from netspec.proto.schema import TEST
 from netspec.terminal.parser import Commands
@@ -23,7 +23,7 @@ def add_commands(commands: Commands) -> None:
     for name, (function, text) in _UPGRADES.items():
         parser = commands.add_parser(name, function, help=text)
         if function is _upgrade_net_proto_text:
-            add(parser, "plugin")
+            add_plugin(parser)
         parser.add_argument("input", metavar="IN", help="the file to read")
         parser.add_output("output", type=Path, metavar="OUT", help="the file to write")
 
@@ -33,7 +33,8 @@ def _add_extract_features(commands: Commands) -> None:
         "extract_features", _extract_features, help="write blobs to databases of float Datums (extract_features)"
     )
     parser.set_defaults(log_level=logging.WARNING)
-    add(parser, "plugin", "limit")
+    add_plugin(parser)
+    add_limit(parser)
     parser.add_argument("weights", metavar="WEIGHTS", help="the trained weights")
     parser.add_argument("model", metavar="MODEL", help="the net's prototxt, with a data layer")
     parser.add_argument("blobs", metavar="BLOBS", help="blob names, separated by commas")

@@ -11,7 +11,31 @@ from pathlib import Path
 from typing import Any
 
 from netspec import log
-from netspec.cli.arguments import add, blob_shape, choice, device, model, options, positive, run_by, stages
+from netspec.cli.arguments import (
+    add_blob,
+    add_engine,
+    add_exact,
+    add_gpu,
+    add_limit,
+    add_net,
+    add_passes,
+    add_phase,
+    add_pixels,
+    add_plugin,
+    add_python,
+    add_shape,
+    add_state,
+    add_strict,
+    add_verbose,
+    blob_shape,
+    choice,
+    device,
+    model,
+    options,
+    positive,
+    run_by,
+    stages,
+)
 from netspec.errors import SpecError
 from netspec.files.limits import amount
 from netspec.files.whole_file import whole_file
@@ -50,9 +74,12 @@ def _add_extract(commands: Commands) -> None:
     parser = commands.add_parser(
         "extract", _extract, help="write blobs to an .npz file, for the records of a data layer or for images"
     )
-    add(parser, "verbose", "plugin", "limit", "net")
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
+    add_net(parser)
     parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
-    add(parser, "blob", required=True, help="the blobs to write")
+    add_blob(parser, required=True, text="the blobs to write")
     parser.add_output("--out", type=Path, required=True, metavar="OUT", help="the .npz to write")
     parser.add_argument(
         "--source",
@@ -63,7 +90,14 @@ def _add_extract(commands: Commands) -> None:
         help="let data layer LAYER read this database instead of its own",
     )
     parser.add_argument("--iterations", type=positive, metavar="N", help="batches to run (default: every record once)")
-    add(parser, "gpu", "phase", "state", "python", "exact", "passes", "strict", "engine")
+    add_gpu(parser)
+    add_phase(parser)
+    add_state(parser)
+    add_python(parser)
+    add_exact(parser)
+    add_passes(parser)
+    add_strict(parser)
+    add_engine(parser)
     group = parser.add_argument_group(
         "image files", "With any of the last four options, the data layer's transform_param is not used."
     )
@@ -80,7 +114,7 @@ def _add_extract(commands: Commands) -> None:
     group.add_argument(
         "--shape", type=blob_shape, metavar="BLOB=N,C,H,W", help="the input blob's shape, if its data is not available"
     )
-    add(group, "pixels")
+    add_pixels(group)
 
 
 def _extract(arguments: argparse.Namespace) -> None:
@@ -201,7 +235,9 @@ def _add_export(commands: Commands) -> None:
         description=EXPORT,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add(parser, "verbose", "plugin", "limit")
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
     parser.add_argument("file", metavar="FILE", help="the net's prototxt")
     parser.add_argument("--to", required=True, choices=list(WRITTEN), help="the format")
     parser.add_argument("--weights", metavar="WEIGHTS", help="the trained weights (default: random weights)")
@@ -216,7 +252,7 @@ def _add_export(commands: Commands) -> None:
     )
     group.add_argument("--uint8", action="store_true", help="they are uint8")
     group.add_argument("--crop", action="store_true", help="crop larger images to their center")
-    add(group, "pixels")
+    add_pixels(group)
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -245,14 +281,18 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _add_part(parser: Parser) -> None:
     """Add the options that choose the part of a net to write."""
-    add(parser, "blob", help="only the layers that compute these blobs")
-    add(parser, "shape", help="the shape of an input or a data layer's top")
-    add(parser, "phase", "state", "python")
+    add_blob(parser, text="only the layers that compute these blobs")
+    add_shape(parser, text="the shape of an input or a data layer's top")
+    add_phase(parser)
+    add_state(parser)
+    add_python(parser)
 
 
 def _add_fold(commands: Commands) -> None:
     parser = commands.add_parser("fold", _fold, help="fold BatchNorm and Scale layers into the layers before them")
-    add(parser, "verbose", "plugin", "limit")
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
     parser.add_argument(
         "file", metavar="MODEL", help="the net's prototxt; the labels and losses of a training net are removed"
     )

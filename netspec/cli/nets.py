@@ -8,7 +8,19 @@ import shutil
 import sys
 from pathlib import Path
 
-from netspec.cli.arguments import add, options
+from netspec.cli.arguments import (
+    add_data,
+    add_limit,
+    add_passes,
+    add_phase,
+    add_plugin,
+    add_python,
+    add_shape,
+    add_state,
+    add_strict,
+    add_verbose,
+    options,
+)
 from netspec.errors import printable
 from netspec.files.limits import no_collection
 from netspec.proto.schema import PHASES, TEST, TRAIN
@@ -22,18 +34,22 @@ def add_commands(commands: Commands) -> None:
     _add_lint(commands)
     _add_draw(commands)
     _add_diff(commands)
-    add(commands.add_parser("layers", _layers, help="list the layer types, each with its description"), "plugin")
+    parser = commands.add_parser("layers", _layers, help="list the layer types, each with its description")
+    add_plugin(parser)
 
 
 def _add_check(commands: Commands) -> None:
     parser = commands.add_parser(
         "check", _check, help="build a net, or a solver's nets, and report all errors; no file is written"
     )
-    add(parser, "verbose", "plugin", "limit")
+    add_verbose(parser)
+    add_plugin(parser)
+    add_limit(parser)
     parser.add_argument("file", metavar="FILE", help="a net's or a solver's prototxt")
-    add(parser, "phase", "state")
-    add(parser, "shape", help="shape of a data layer's top, instead of opening its data")
-    add(parser, "data")
+    add_phase(parser)
+    add_state(parser)
+    add_shape(parser, text="shape of a data layer's top, instead of opening its data")
+    add_data(parser)
     parser.add_argument(
         "--weights", metavar="WEIGHTS", help="check that these weights fit the net; several separated by commas"
     )
@@ -42,13 +58,14 @@ def _add_check(commands: Commands) -> None:
         action="store_true",
         help="print the steps in which the net runs without gradients; this allocates its memory",
     )
-    add(parser, "passes")
+    add_passes(parser)
     parser.add_argument(
         "--json",
         action="store_true",
         help="print blobs, params, inputs and outputs as JSON, or the errors if there are any",
     )
-    add(parser, "strict", "python")
+    add_strict(parser)
+    add_python(parser)
 
 
 @no_collection()  # of the whole command: of the text and the table too
@@ -98,15 +115,16 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _add_lint(commands: Commands) -> None:
     parser = commands.add_parser("lint", _lint, help="find probable mistakes in nets and solvers")
-    add(parser, "plugin")
+    add_plugin(parser)
     parser.add_argument("files", nargs="*", default=[], metavar="FILE", help="a net's or a solver's prototxt")
     parser.add_argument("--rules", action="store_true", help="print the rules and their reasons")
     parser.add_argument(
         "--json", action="store_true", help="print errors and findings as JSON, one object for each file"
     )
-    add(parser, "state")
-    add(parser, "shape", help="the shape of a data layer's top; some rules need shapes")
-    add(parser, "data", "python")
+    add_state(parser)
+    add_shape(parser, text="the shape of a data layer's top; some rules need shapes")
+    add_data(parser)
+    add_python(parser)
 
 
 def _lint(arguments: argparse.Namespace) -> int:
@@ -141,17 +159,17 @@ FORMATS = (".svg", ".png", ".html")
 
 def _add_draw(commands: Commands) -> None:
     parser = commands.add_parser("draw", _draw, help="draw a net: layers, shapes, shared parameters, multiply-adds")
-    add(parser, "plugin")
+    add_plugin(parser)
     parser.add_argument("file", metavar="FILE", help="a net, or a solver (its training net is drawn)")
     parser.add_output("--out", type=Path, required=True, metavar="F.svg|F.png|F.html", help="the file to write")
-    add(parser, "phase", default=None, help="only this phase (default: both in one)")
-    add(parser, "state")
-    add(parser, "shape", help="the shape of a data layer's top, if it is not known from the prototxt")
-    add(parser, "data", help="open databases and lists to learn their shapes")
+    add_phase(parser, default=None, text="only this phase (default: both in one)")
+    add_state(parser)
+    add_shape(parser, text="the shape of a data layer's top, if it is not known from the prototxt")
+    add_data(parser, text="open databases and lists to learn their shapes")
     parser.add_argument(
         "--unfold", action="store_true", help="draw every copy of a repeated block (an HTML page has both forms)"
     )
-    add(parser, "python")
+    add_python(parser)
 
 
 def _draw(arguments: argparse.Namespace) -> None:
@@ -186,7 +204,7 @@ def _add_diff(commands: Commands) -> None:
         "diff", _diff, help="print how two nets, solvers or weights differ, ignoring their formatting"
     )
     parser.set_defaults(fault_status=UNREADABLE)
-    add(parser, "plugin")
+    add_plugin(parser)
     parser.add_argument("first", metavar="A", help="a prototxt, a .caffemodel or a .caffemodel.h5")
     parser.add_argument("second", metavar="B", help="another of the same kind")
     parser.add_argument(

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from netspec.cli.arguments import add
+from netspec.cli.arguments import add_limit, add_plugin
 from netspec.files.limits import LIMIT
 from netspec.terminal.commands import WrongUsage
 from netspec.terminal.output import VARIABLE
@@ -25,7 +25,8 @@ def add_commands(commands: Commands) -> None:
         help="run a Python 3 script in which `import caffe` imports netspec",
         usage="netspec run [options] (SCRIPT | -m MODULE) [arguments of the script]",
     )
-    add(parser, "plugin", "limit")
+    add_plugin(parser)
+    add_limit(parser)
     parser.add_argument("-m", action="store_true", help="run a module, as python -m does")
     parser = commands.add_parser(
         "install-caffe",
