@@ -101,6 +101,7 @@ def gemm(
     matrix A or B is used N times. To a single matrix C, with ``add``, all products are added.
     """
     a, b = _without_gaps(a), _without_gaps(b)
+    assert _without_gaps(c) is c, "the rows of a matrix must be contiguous"
     call = _gemm(c.dtype, b_t, a_t, c.shape[-1], c.shape[-2], a.shape[-2 if a_t else -1], add)
     at_a, at_b, at_c = a.data_ptr(), b.data_ptr(), c.data_ptr()
     step_a, step_b, step_c = _step(a), _step(b), _step(c)
@@ -190,8 +191,7 @@ def _are_stored_by_rows(matrices: torch.Tensor) -> bool:
 
 
 def _step(matrices: torch.Tensor) -> int:
-    """Return the bytes from one matrix to the next; 0 for a single one. The rows must have no gaps."""
-    assert matrices.is_contiguous() or _are_stored_by_rows(matrices), "the rows of a matrix must be contiguous"
+    """Return the bytes from one matrix to the next; 0 for a single one."""
     return matrices.stride(0) * matrices.element_size() if matrices.dim() == 3 else 0
 
 

@@ -358,9 +358,9 @@ class Layer(torch.nn.Module):
 
     def _reshaped(self, bottom_shapes: list[Shape]) -> list[Shape]:
         """Return the result of ``reshape``, after checking that it has a possible shape for each top."""
-        empty = [i for i, shape in enumerate(bottom_shapes) if 0 in shape[1:]]
-        if empty and not self.takes_empty:
-            raise self.error(f"found an empty bottom, of shape {bottom_shapes[empty[0]]}", "bottom", empty[0])
+        for i, shape in enumerate(() if self.takes_empty else bottom_shapes):
+            if 0 in shape[1:]:
+                raise self.error(f"found an empty bottom, of shape {shape}", "bottom", i)
         shapes: Any = self.reshape(bottom_shapes)
         if not isinstance(shapes, Sequence) or not all(isinstance(shape, Sequence) for shape in shapes):
             raise self.error(f"reshape returned {shapes!r}, expected one shape for each top, such as [(2, 3)]", "type")
