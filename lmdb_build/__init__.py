@@ -13,7 +13,22 @@ if TYPE_CHECKING:
     from lmdb_build.pairs.by_pose import PoseRule, PoseSource, Scenes
     from lmdb_build.pairs.list_file import read_pair_list, write_pair_list
 
-_HOMES = ("databases", "pairs.build", "pairs.by_pose", "pairs.list_file")
+_HOMES = {
+    "DatumOptions": "lmdb_build.databases",
+    "Plan": "lmdb_build.pairs.build",
+    "PoseRule": "lmdb_build.pairs.by_pose",
+    "PoseSource": "lmdb_build.pairs.by_pose",
+    "Scenes": "lmdb_build.pairs.by_pose",
+    "build_lists": "lmdb_build.pairs.build",
+    "image_key": "lmdb_build.databases",
+    "pair_key": "lmdb_build.databases",
+    "read_pair_list": "lmdb_build.pairs.list_file",
+    "read_pairs": "lmdb_build.databases",
+    "read_single_list": "lmdb_build.databases",
+    "write_databases": "lmdb_build.databases",
+    "write_pair_list": "lmdb_build.pairs.list_file",
+}
+
 __all__ = [
     "DatumOptions",
     "Plan",
@@ -32,9 +47,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> "Any":
-    if name not in __all__:
+    if name not in _HOMES:
         raise AttributeError(f"module 'lmdb_build' has no attribute {name!r}")
     from importlib import import_module
 
-    homes = (import_module(f"lmdb_build.{home}") for home in _HOMES)
-    return next(getattr(home, name) for home in homes if hasattr(home, name))
+    return getattr(import_module(_HOMES[name]), name)
