@@ -28,6 +28,7 @@ class Cache:
     describe: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():  # pickle is safe here: save() wrote the file
             self.rows, self.agreements = pickle.loads(self.path.read_bytes())
         self.pairs = Pairs(read_gray, _found=self.agreements)
@@ -45,6 +46,5 @@ class Cache:
 
     def save(self) -> None:
         """Write the file."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(self.path) as unfinished:
             unfinished.write_bytes(pickle.dumps((self.rows, self.agreements)))

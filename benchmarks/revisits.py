@@ -8,6 +8,7 @@ by a bag of ORB words, if a fundamental matrix agrees. Nothing is warped, relit 
 from __future__ import annotations
 
 import csv
+import functools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -81,10 +82,16 @@ def drives(data: Path, only: Sequence[str] = ()) -> Iterator[Real]:
     """Yield the drives in the folder ``data``: all, or those with a name that begins as one of ``only``."""
     for name, load in _drives(data).items():
         if not only or name.startswith(tuple(only)):
-            rooms = sorted((data / "seven_scenes").glob("chess_*"))
-            others = [path for room in rooms for path in read_sequence(room, "tum").paths]
-            train = others[::2] if name.startswith("tower") else tower_images(data / "ie_tower")[::4]
-            yield replace(load(), name=name, train=train)
+            yield replace(load(), name=name, train=_training(data, name.startswith("tower")))
+
+
+@functools.cache
+def _training(data: Path, for_tower: bool) -> list[Path]:
+    """Return images of another place: of chess for drives in the tower, of the tower for all others."""
+    if not for_tower:
+        return tower_images(data / "ie_tower")[::4]
+    rooms = sorted((data / "seven_scenes").glob("chess_*"))
+    return [path for room in rooms for path in read_sequence(room, "tum").paths][::2]
 
 
 def _drives(data: Path) -> dict[str, Callable[[], Real]]:
